@@ -1,0 +1,57 @@
+# make test   everything that must hold: lint, types, rooms, tests
+# make demo   a quick study; says where its result is
+# make lock   resolve the dependencies anew and write requirements.lock
+# make lowest run the tests with the lowest version of each dependency that pyproject.toml admits
+
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+INSTALLED := $(VENV)/.installed
+PIP_OPTIONS := --disable-pip-version-check --progress-bar off --quiet
+IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "fleetloc needs Python 3.11 or newer, found " + sys.version.split()[0] + "; choose one with: make PYTHON=python3.12")
+DEMO_RESULT := out/demo/table1.json
+
+.PHONY: test demo lock lowest clean
+
+test: $(INSTALLED)
+	$(BIN)/ruff check
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/pytest -n 2
+
+demo: $(INSTALLED)
+	mkdir -p $(dir $(DEMO_RESULT))
+	$(BIN)/fleetloc bench table1 --runs 4 --json $(DEMO_RESULT)
+	@echo "result: $(DEMO_RESULT)"
+
+# The stamp is newer than the lock and the project file exactly when both are installed.
+$(INSTALLED): requirements.lock pyproject.toml
+	@test -x $(BIN)/python || { $(PYTHON) -c '$(IS_NEW_ENOUGH)' && $(PYTHON) -m venv $(VENV); }
+	@$(BIN)/python -c '$(IS_NEW_ENOUGH)'
+	@echo "installing into $(VENV) (a minute or two)"
+	@$(BIN)/python -m pip install $(PIP_OPTIONS) -r requirements.lock
+	@$(BIN)/python -m pip install $(PIP_OPTIONS) --no-deps --editable .
+	@touch $@
+
+lock:
+	$(PYTHON) -c '$(IS_NEW_ENOUGH)'
+	rm -rf build/lock
+	$(PYTHON) -m venv build/lock
+	build/lock/bin/python -m pip install $(PIP_OPTIONS) '.[dev,compare,serial,ulog]'
+	{ echo "# Every package of a working environment, pinned; made by make lock."; \
+	  build/lock/bin/python -m pip freeze --exclude fleetloc; } > build/requirements.lock
+	mv build/requirements.lock requirements.lock
+	rm -rf build/lock
+
+lowest:
+	$(PYTHON) -c '$(IS_NEW_ENOUGH)'
+	rm -rf build/lowest
+	$(PYTHON) -m venv build/lowest
+	$(PYTHON) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	  print(*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' | sed 's/>=/==/' > build/lowest.txt
+	build/lowest/bin/python -m pip install $(PIP_OPTIONS) -r build/lowest.txt
+	build/lowest/bin/python -m pip install $(PIP_OPTIONS) --no-deps --editable .
+	build/lowest/bin/python -m pytest -n 2
+
+clean:
+	rm -rf $(VENV) build out .mypy_cache .ruff_cache .pytest_cache .hypothesis .import_linter_cache *.egg-info

@@ -1,0 +1,70 @@
+"""Streams and key expressions: ``cl/v1/{fleet}/agent/{id:03d}/{stream}``.
+
+Tick and round are in the packet header, never in the key: every key costs declarations on all peers.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+
+from transport.errors import SettingsError
+
+PREFIX = "cl/v1"
+MIN_AGENT_ID, MAX_AGENT_ID = 1, 999
+
+_FLEET_NAME = re.compile(r"[a-z0-9_-]{1,32}")
+_KEY = re.compile(rf"{PREFIX}/([a-z0-9_-]{{1,32}})/agent/([0-9]{{3}})/([a-z]+)")
+
+
+class Stream(StrEnum):
+    """Last chunk of an agent's key expressions."""
+
+    MEAS = "meas"
+    """Measurement records, every tick."""
+    INFO = "info"
+    """Consensus information, every round."""
+    EST = "est"
+    """The agent's estimate of the fleet, every tick."""
+    UWB = "uwb"
+    """Ranges from a UWB driver process to the agent of the same id (``uwb-range/1``, no packet header)."""
+    ALIVE = "alive"
+    """Liveliness token."""
+    CARD = "card"
+    """What the agent is; sent on change and whenever a neighbour appears."""
+    CLOCK = "clock"
+    """Queryable for the clock offset."""
+    DIAG = "diag"
+    """Health and counters, once a second."""
+
+
+def check_fleet_name(fleet: str) -> str:
+    """The name itself; raises `SettingsError` unless it is 1 to 32 of ``a-z 0-9 _ -``."""
+    if not _FLEET_NAME.fullmatch(fleet):
+        raise SettingsError(f"fleet name {fleet!r}: expected 1 to 32 characters of a-z, 0-9, '_' and '-'")
+    return fleet
+
+
+def check_agent_id(agent_id: int) -> int:
+    """The id itself; raises `SettingsError` unless it is an integer from 1 to 999."""
+    if isinstance(agent_id, bool) or not isinstance(agent_id, int) or not 1 <= agent_id <= MAX_AGENT_ID:
+        raise SettingsError(f"agent id {agent_id!r}: expected an integer from 1 to {MAX_AGENT_ID}")
+    return agent_id
+
+
+def key_expression(fleet: str, agent_id: int, stream: Stream) -> str:
+    """Key of one stream of one agent; raises `SettingsError` for a bad fleet name or id."""
+    return f"{PREFIX}/{check_fleet_name(fleet)}/agent/{check_agent_id(agent_id):03d}/{stream.value}"
+
+
+def presence_pattern(fleet: str) -> str:
+    """Key expression that matches the liveliness tokens of the whole fleet."""
+    return f"{PREFIX}/{check_fleet_name(fleet)}/agent/*/{Stream.ALIVE.value}"
+
+
+def parse_key(key: str) -> tuple[str, int, Stream] | None:
+    """Fleet, agent id and stream of a key; ``None`` if it is not one of ours."""
+    match = _KEY.fullmatch(key)
+    if match is None or match[3] not in Stream.__members__.values() or int(match[2]) < MIN_AGENT_ID:
+        return None
+    return match[1], int(match[2]), Stream(match[3])

@@ -1,0 +1,346 @@
+"""Reading, checking and printing a fleet's configuration: one TOML file for the whole fleet.
+
+Order of precedence: override (``--set key=value``) over file over default. Everything wrong raises one
+`ConfigError` that says where, which key, what was expected and what was found.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import re
+import tomllib
+import typing
+from collections.abc import Iterable, Mapping
+from pathlib import Path as FilePath
+from typing import Any
+
+import msgspec
+
+from agent.config_tables import AgentTable as AgentTable
+from agent.config_tables import CirclePath as CirclePath
+from agent.config_tables import FigureEightPath as FigureEightPath
+from agent.config_tables import FleetConfig as FleetConfig
+from agent.config_tables import FleetTable as FleetTable
+from agent.config_tables import GpsOutage as GpsOutage
+from agent.config_tables import InitialTable as InitialTable
+from agent.config_tables import MavlinkTable as MavlinkTable
+from agent.config_tables import OriginTable as OriginTable
+from agent.config_tables import Path as Path
+from agent.config_tables import RecordTable as RecordTable
+from agent.config_tables import SecurityTable as SecurityTable
+from agent.config_tables import SensorsTable as SensorsTable
+from agent.config_tables import SimTable as SimTable
+from agent.config_tables import TransportTable as TransportTable
+from agent.config_tables import WaypointsPath as WaypointsPath
+from agent.endpoints import SPELLINGS, LinkKind, parse_endpoint
+from agent.errors import ConfigError, EndpointError
+from estimators.settings import EstimatorSettings
+
+MAX_FILE_BYTES = 1_000_000
+IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
+OTHER_BYTES_PER_S = 500
+"""Heartbeats, TIMESYNC and the like, with room for what the autopilot sends by itself."""
+BAUD_SHARE, BITS_PER_BYTE = 0.7, 10
+OVERRIDE = "override"
+PLAIN_NAMES = {
+    "float": "a number",
+    "int": "a whole number",
+    "str": "a string",
+    "bool": "true or false",
+    "object": "a table",
+    "array": "an array",
+}
+
+
+def load_config(path: str | FilePath, overrides: Iterable[str] = ()) -> FleetConfig:
+    """Read a fleet's configuration.
+
+    ``overrides`` are ``key=value`` with dotted keys and TOML values (a bare word is a string), e.g.
+    ``estimator.window=3`` or ``agents.2.mavlink=udpin:127.0.0.1:14562``, where 2 is the agent's id. Raises
+    `ConfigError`.
+    """
+    return config_from(read_document(path), str(path), overrides)
+
+
+def load_estimator_settings(path: str | FilePath | None, overrides: Iterable[str] = ()) -> EstimatorSettings:
+    """Only the ``[estimator]`` table of a configuration (None: the defaults), with its overrides.
+
+    The rest of the file is not looked at: a tick-level recording brings its own fleet. Raises `ConfigError`,
+    also for an override outside the table.
+    """
+    document = {} if path is None else read_document(path)
+    overrides = list(overrides)
+    for override in overrides:
+        key = override.partition("=")[0].strip()
+        if not key.startswith("estimator."):
+            raise ConfigError(OVERRIDE, key, "a key of the table estimator (estimator.<name>=value)", repr(override))
+    origin = {"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0}
+    stub: dict[str, Any] = {
+        "fleet": {"name": "recording", "origin": origin},
+        "agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:0"}],
+    }
+    table = {"estimator": document["estimator"]} if "estimator" in document else {}
+    return config_from(stub | table, "defaults" if path is None else str(path), overrides).estimator
+
+
+def read_document(path: str | FilePath) -> dict[str, Any]:
+    """A TOML file as it stands; raises `ConfigError`."""
+    file = str(path)
+    try:
+        raw = FilePath(path).read_bytes()
+    except OSError as error:
+        raise ConfigError(file, "file", "a readable TOML file", error.strerror or str(error)) from error
+    if len(raw) > MAX_FILE_BYTES:
+        raise ConfigError(file, "file", f"at most {MAX_FILE_BYTES} bytes", f"{len(raw)} bytes")
+    try:
+        text = raw.decode("utf-8")
+        return tomllib.loads(text)
+    except (UnicodeDecodeError, tomllib.TOMLDecodeError) as error:
+        raise ConfigError(file, "syntax", "valid TOML", str(error)) from error
+
+
+def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] = ()) -> FleetConfig:
+    """The checked configuration of a decoded TOML document; ``where`` names it in errors."""
+    overridden = {_override(document, override) for override in overrides}
+    _check_finite(document, where, "")
+    try:
+        config = msgspec.convert(document, FleetConfig)
+    except msgspec.ValidationError as error:
+        raise _explained(error, document, where, overridden) from error
+    _check_agents(config, where)
+    _check_references(config, where)
+    _check_times(config, where)
+    return config
+
+
+def dump(config: FleetConfig) -> str:
+    """The effective configuration as TOML, defaults filled in; `load_config` reads it back unchanged."""
+    lines: list[str] = []
+    for name, table in msgspec.to_builtins(config).items():
+        for entry in table if isinstance(table, list | tuple) else (table,):
+            lines.append(f"[{name}]" if entry is table else f"[[{name}]]")
+            lines += [f"{key} = {_toml(value)}" for key, value in entry.items() if value is not None]
+            lines.append("")
+    return "\n".join(lines)
+
+
+def _toml(value: Any) -> str:
+    """A value as TOML, tables inline; the standard library only reads TOML."""
+    if isinstance(value, dict):
+        items = (f"{key} = {_toml(item)}" for key, item in value.items() if item is not None)
+        return f"{{ {', '.join(items)} }}"
+    if isinstance(value, list | tuple):
+        return f"[{', '.join(map(_toml, value))}]"
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        return json.dumps(value, ensure_ascii=False).replace("\x7f", "\\u007f")
+    return repr(value)
+
+
+def _override(document: dict[str, Any], override: str) -> str:
+    """Put one ``key=value`` into the document; returns the key of its place as errors spell it."""
+    where = OVERRIDE
+    key, separator, text = override.partition("=")
+    names = key.strip().split(".")
+    if not separator or not all(names):
+        raise ConfigError(where, key or "key", "key=value with a dotted key", repr(override))
+    try:
+        value = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text.strip()
+    place: Any = document
+    spelled = ""
+    for depth, name in enumerate(names):
+        step: Any = name
+        if isinstance(place, list):
+            step = _index_of(place, name, spelled, where)
+            spelled += f"[{step}]"
+        elif isinstance(place, dict):
+            spelled += f".{name}" if spelled else name
+        else:
+            raise ConfigError(where, spelled, "a table", repr(place))
+        if depth == len(names) - 1:
+            place[step] = value
+        else:
+            place = place.setdefault(step, {}) if isinstance(place, dict) else place[step]
+    return spelled
+
+
+def _index_of(tables: list[Any], name: str, spelled: str, where: str) -> int:
+    """Index of the table with that id (agents) or agent (paths, outages)."""
+    keys = {str(t.get("id", t.get("agent"))): i for i, t in enumerate(tables) if isinstance(t, dict)}
+    if name not in keys:
+        raise ConfigError(where, f"{spelled}.{name}", f"one of the ids {', '.join(keys) or 'none'}", name)
+    return keys[name]
+
+
+def _explained(
+    error: msgspec.ValidationError, document: Mapping[str, Any], where: str, overridden: set[str]
+) -> ConfigError:
+    """Turn msgspec's message (what, at which path) into one that also names what was found."""
+    message = str(error)
+    match = re.fullmatch(r"(.*?)(?: - at `(?:key in )?\$\.?(.*)`)?", message, re.DOTALL)
+    what, path = (match.group(1), match.group(2) or "") if match else (message, "")
+    unknown = re.search(r"unknown field `([^`]*)`", what)
+    missing = re.search(r"missing required field `([^`]*)`", what)
+    if unknown:
+        key = f"{path}.{unknown.group(1)}" if path else unknown.group(1)
+        expected, found = _one_of(_known_keys(path, document)), "an unknown key"
+    elif missing:
+        key = f"{path}.{missing.group(1)}" if path else missing.group(1)
+        expected, found = "a value (the key is required)", "nothing"
+    else:
+        key = path
+        plain = re.sub(r"`(\w+)`", lambda name: PLAIN_NAMES.get(name.group(1), name.group(1)), what)
+        expected = _choices(path) if what.startswith("Invalid") else re.sub(r"^Expected |, got .*$", "", plain)
+        found = _abbreviated(_value_at(document, path))
+    return ConfigError(OVERRIDE if key in overridden else where, key, expected, found)
+
+
+def _steps(path: str) -> list[str | int]:
+    """``sim.paths[0].points_m[1]`` as keys and indices."""
+    return [int(i) if i else name for name, i in re.findall(r"([A-Za-z0-9_-]+)|\[(\d+|\.\.\.)\]", path)]
+
+
+def _value_at(document: Any, path: str) -> Any:
+    value = document
+    for step in _steps(path):
+        try:
+            value = value[step]
+        except (KeyError, IndexError, TypeError):
+            return value
+    return value
+
+
+def _abbreviated(value: Any) -> str:
+    text = repr(value)
+    return text if len(text) <= 80 else f"{text[:77]}..."
+
+
+def _known_keys(path: str, document: Mapping[str, Any]) -> list[str]:
+    """Names of the keys that the table at ``path`` may have; of a union, those of the ``kind`` given."""
+    names: list[str] = []
+    structs = typing.get_args(_type_at(path)) or (_type_at(path),)
+    tag = _value_at(document, f"{path}.kind")
+    for struct in structs:
+        tag_field = struct.__struct_config__.tag_field
+        if len(structs) == 1 or struct.__struct_config__.tag == tag:
+            names += ([tag_field] if tag_field else []) + list(struct.__struct_encode_fields__)
+    return names
+
+
+def _choices(path: str) -> str:
+    """What may stand at a key whose values are enumerated."""
+    table, _, key = path.rpartition(".")
+    if key == "kind" and typing.get_args(_type_at(table)):
+        return _one_of(struct.__struct_config__.tag for struct in typing.get_args(_type_at(table)))
+    return _one_of(typing.get_args(_type_at(path)))
+
+
+def _one_of(values: Iterable[Any]) -> str:
+    return f"one of {', '.join(str(value) for value in values)}"
+
+
+def _type_at(path: str) -> Any:
+    """Declared type at a path, annotations and ``None`` stripped."""
+    kind: Any = FleetConfig
+    for step in _steps(path):
+        inner = typing.get_args(kind)[0] if isinstance(step, int) else typing.get_type_hints(kind)[step]
+        kind = _stripped(inner)
+    return kind
+
+
+def _stripped(kind: Any) -> Any:
+    """A type without ``None`` alternatives."""
+    alternatives = [a for a in typing.get_args(kind) if a is not type(None)]
+    return alternatives[0] if type(None) in typing.get_args(kind) and len(alternatives) == 1 else kind
+
+
+def _check_finite(value: Any, where: str, key: str) -> None:
+    """TOML can write nan and inf; no setting can be either."""
+    if isinstance(value, dict):
+        for name, item in value.items():
+            _check_finite(item, where, f"{key}.{name}" if key else name)
+    elif isinstance(value, list):
+        for index, item in enumerate(value):
+            _check_finite(item, where, f"{key}[{index}]")
+    elif isinstance(value, float) and not math.isfinite(value):
+        raise ConfigError(where, key, "a finite number", str(value))
+
+
+def _check_agents(config: FleetConfig, where: str) -> None:
+    seen: dict[str, int] = {}
+    for index, agent in enumerate(config.agents):
+        if agent.id in config.ids[:index]:
+            raise ConfigError(where, f"agents[{index}].id", "distinct ids", f"a second agent {agent.id}")
+        key = f"agents[{index}].mavlink"
+        try:
+            endpoint = parse_endpoint(agent.mavlink)
+        except EndpointError as error:
+            raise ConfigError(where, key, SPELLINGS, str(error)) from error
+        opened = f"{endpoint.host}:{endpoint.port}" if endpoint.kind is not LinkKind.SERIAL else endpoint.host
+        if opened in seen and not opened.endswith(":0"):
+            raise ConfigError(where, key, f"another address than agent {seen[opened]}'s", repr(agent.mavlink))
+        seen[opened] = agent.id
+        if endpoint.kind is LinkKind.SERIAL:
+            _check_baud(config, where, key, endpoint.port)
+        if agent.id > 255 and agent.system_id is None:
+            expected = f"1..255, since the id {agent.id} is no system id"
+            raise ConfigError(where, f"agents[{index}].system_id", expected, "nothing")
+
+
+def _check_baud(config: FleetConfig, where: str, key: str, baud: int) -> None:
+    """Refuse a serial line that the requested streams would fill: frames would be lost without a word."""
+    settings = config.mavlink
+    needed = (
+        settings.imu_hz * IMU_FRAME_BYTES
+        + settings.attitude_hz * ATTITUDE_FRAME_BYTES
+        + settings.gps_hz * GPS_FRAME_BYTES
+        + OTHER_BYTES_PER_S
+    )
+    usable = BAUD_SHARE * baud / BITS_PER_BYTE
+    if needed > usable:
+        expected = f"a baud rate of {needed * BITS_PER_BYTE / BAUD_SHARE:.0f} or more for the rates in [mavlink]"
+        raise ConfigError(where, key, expected, str(baud))
+
+
+def _check_references(config: FleetConfig, where: str) -> None:
+    for index, edge in enumerate(config.fleet.edges or ()):
+        _known(config, where, f"fleet.edges[{index}]", edge)
+        if edge[0] == edge[1]:
+            raise ConfigError(where, f"fleet.edges[{index}]", "two different agents", f"{list(edge)}")
+    for index, outage in enumerate(config.sim.gps_outages):
+        key = f"sim.gps_outages[{index}]"
+        _known(config, where, f"{key}.agent", (outage.agent,))
+        if outage.to_s <= outage.from_s:
+            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
+    flown: set[int] = set()
+    for index, path in enumerate(config.sim.paths):
+        key = f"sim.paths[{index}].agent"
+        _known(config, where, key, (path.agent,))
+        if path.agent in flown:
+            raise ConfigError(where, key, "one path per agent", f"a second path of agent {path.agent}")
+        flown.add(path.agent)
+
+
+def _known(config: FleetConfig, where: str, key: str, ids: Iterable[int]) -> None:
+    for agent_id in ids:
+        if agent_id not in config.ids:
+            raise ConfigError(where, key, f"ids of agents ({', '.join(map(str, config.ids))})", str(agent_id))
+
+
+def _check_times(config: FleetConfig, where: str) -> None:
+    transport = config.transport
+    used = transport.exchange_fraction + transport.rounds_fraction
+    if used > 1.0:
+        expected = "at most 1 together with transport.exchange_fraction"
+        raise ConfigError(where, "transport.rounds_fraction", expected, f"{used:g}")
+    if transport.guard_s >= transport.exchange_fraction * config.fleet.period_s:
+        expected = "less than transport.exchange_fraction of fleet.period_s"
+        raise ConfigError(where, "transport.guard_s", expected, f"{transport.guard_s:g}")
+    last = transport.base_port + len(config.agents) - 1
+    if last > 65535:
+        found = f"{last} for the last"
+        raise ConfigError(where, "transport.base_port", "a port for each agent up to 65535", found)

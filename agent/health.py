@@ -1,0 +1,112 @@
+"""How an agent is: one state, the reasons for it, and when it changed. Sans-I/O."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+from estimators.estimator import Status
+
+GPS_LOST_S = 1.5
+MIN_IMU_COVERAGE = 0.9
+DEGRADED_SIGMA_M = 5.0
+FAULT_SIGMA_M = 50.0
+ALIGNED_SIGMA_M = 2.0
+REPORT_PERIOD_S = 1.0
+"""A state that flaps is reported no more often than this; what is reported is the latest."""
+
+
+class State(StrEnum):
+    """What an estimate may be used for."""
+
+    INIT = "init"
+    """No estimate yet."""
+    ALIGNING = "aligning"
+    """Started, not yet sure enough."""
+    OK = "ok"
+    DEGRADED = "degraded"
+    """Usable; something that should be there is not."""
+    FAULT = "fault"
+    """Not to be used."""
+
+
+@dataclass(frozen=True, slots=True)
+class Facts:
+    """What the state follows from; ``None`` where there is nothing to be said yet."""
+
+    status: Status | None
+    """Of the latest estimate; ``None`` before the start."""
+    own_sigma_m: float
+    """Largest 1-sigma of the own position's axes."""
+    gps_age_s: float | None
+    """Since the last own fix."""
+    imu_coverage: float
+    """Share of the latest tick that the IMU vouches for."""
+    silent_neighbours: tuple[int, ...]
+    """Configured neighbours not heard of lately."""
+    autopilot: str
+    """State of the autopilot's link."""
+    waiting_for: str = ""
+    """What the start waits for."""
+
+
+@dataclass(frozen=True, slots=True)
+class Health:
+    """A state with its reasons, the gravest first."""
+
+    state: State
+    reasons: tuple[str, ...]
+
+    def __str__(self) -> str:
+        return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else str(self.state)
+
+
+def assess(facts: Facts, was: State) -> Health:
+    """The health that follows from facts; ``was`` the state before, since alignment is done once."""
+    missing = _missing(facts)
+    if facts.status is None:
+        return Health(State.INIT, (facts.waiting_for, *missing) if facts.waiting_for else missing)
+    if facts.own_sigma_m > FAULT_SIGMA_M and was not in (State.INIT, State.ALIGNING):
+        return Health(State.FAULT, ("position unknown", *missing))
+    if was in (State.INIT, State.ALIGNING) and facts.own_sigma_m > ALIGNED_SIGMA_M:
+        return Health(State.ALIGNING, missing)
+    reasons = list(missing)
+    if facts.own_sigma_m > DEGRADED_SIGMA_M:
+        reasons.insert(0, "position uncertain")
+    if facts.status in (Status.FELL_BACK, Status.NOT_OBSERVABLE, Status.NO_DATA):
+        reasons.insert(0, f"estimate {facts.status.name.lower().replace('_', ' ')}")
+    return Health(State.DEGRADED if reasons else State.OK, tuple(reasons))
+
+
+def _missing(facts: Facts) -> tuple[str, ...]:
+    reasons = []
+    if facts.autopilot != "connected":
+        reasons.append(f"autopilot {facts.autopilot}")
+    if facts.imu_coverage < MIN_IMU_COVERAGE:
+        reasons.append("IMU incomplete")
+    if facts.gps_age_s is None or facts.gps_age_s > GPS_LOST_S:
+        reasons.append("no GPS")
+    if facts.silent_neighbours:
+        reasons.append(f"not heard: {', '.join(map(str, facts.silent_neighbours))}")
+    return tuple(reasons)
+
+
+class HealthMonitor:
+    """Keeps the health and tells when it changed, rate-limited; ``changes`` counts all of them."""
+
+    def __init__(self) -> None:
+        self.health = Health(State.INIT, ())
+        self.changes = 0
+        self._reported = self.health
+        self._next_report_s = float("-inf")
+
+    def update(self, facts: Facts, now_s: float) -> Health | None:
+        """Take in facts; the health if there is a change to be reported now."""
+        health = assess(facts, self.health.state)
+        self.changes += health != self.health
+        self.health = health
+        if health == self._reported or now_s < self._next_report_s:
+            return None
+        self._reported = health
+        self._next_report_s = now_s + REPORT_PERIOD_S
+        return health

@@ -1,0 +1,161 @@
+"""Samples to the records that travel, and records to the rows that estimators take.
+
+A measurement is put to the nearest tick: its row extrapolates with the velocity alone, and what that leaves
+out grows with the offset. (Fixes come at whole tenths of a second, give or take a clock error: taken with the
+tick that they fall into, half of them would be a whole period off.)
+
+An agent feeds its own estimator with its records as the wire rounds them, so that all agents work on the
+same numbers.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from agent.config_tables import SensorsTable
+from agent.samples import GpsSample, RangeSample, Triple
+from agent.timeline import TickInput, nearest_tick
+from estimators.layout import Layout
+from estimators.measurements import (
+    InputTable,
+    RowTable,
+    anchor_range_row,
+    input_rows,
+    position_rows,
+    range_row,
+    speed_row,
+    velocity_rows,
+)
+from transport.measurement_body import (
+    NO_BOUND,
+    AccelerationRecord,
+    AnchorRangeRecord,
+    PositionRecord,
+    RangeRecord,
+    Record,
+    SpeedRecord,
+    VelocityRecord,
+)
+
+UNMEASURED_VARIANCE = 1e6
+"""Stands for an axis that was not measured (the wire has no gap); such an axis makes no row."""
+THREE_D_FIX = 3
+
+
+def gps_records(observer: int, sample: GpsSample, period_s: float, sensors: SensorsTable) -> list[Record]:
+    """Position and speed (or horizontal velocity) of a fix; configured half widths replace its accuracies."""
+    tick = nearest_tick(sample.t_s, period_s)
+    offset_s = sample.t_s - tick * period_s
+    half_width = sensors.gps_position_half_width_m
+    if half_width is None:
+        factor = sensors.gps_variance_factor
+        horizontal, vertical = factor * sample.horizontal_sigma_m**2, factor * sample.vertical_sigma_m**2
+        bounds = NO_BOUND
+    else:
+        horizontal = vertical = half_width**2 / 3
+        bounds = (half_width, half_width, half_width)
+    if sample.fix_type < THREE_D_FIX:
+        vertical = UNMEASURED_VARIANCE
+    variance = (horizontal, horizontal, vertical)
+    position = PositionRecord(observer, tick, sample.position_m, variance, bounds, offset_s)
+    return [position, *_speed_records(observer, tick, offset_s, sample, sensors)]
+
+
+def _speed_records(
+    observer: int, tick: int, offset_s: float, sample: GpsSample, sensors: SensorsTable
+) -> list[Record]:
+    half_width = sensors.gps_speed_half_width_mps
+    variance = sample.speed_sigma_mps**2 if half_width is None else half_width**2 / 3
+    bound = math.inf if half_width is None else half_width
+    if sample.speed_mps is not None:
+        return [SpeedRecord(observer, tick, sample.speed_mps, variance, bound, offset_s)]
+    if sample.ground_velocity_mps is not None:
+        north, east = sample.ground_velocity_mps
+        variances = (variance, variance, UNMEASURED_VARIANCE)
+        bounds = (bound, bound, math.inf)
+        return [VelocityRecord(observer, tick, (north, east, 0.0), variances, bounds, offset_s)]
+    return []
+
+
+def range_record(sample: RangeSample, period_s: float, sensors: SensorsTable) -> RangeRecord:
+    """The record of a range; a configured bound replaces its accuracy."""
+    tick = nearest_tick(sample.t_s, period_s)
+    bound = sensors.uwb_bound_m
+    variance = sample.sigma_m**2 if bound is None else bound**2 / 3
+    half_width = math.inf if bound is None else bound
+    offset_s = sample.t_s - tick * period_s
+    return RangeRecord(sample.observer, tick, sample.target, sample.range_m, variance, half_width, offset_s)
+
+
+def acceleration_record(observer: int, closed: TickInput) -> AccelerationRecord:
+    """The record of a tick's averaged acceleration."""
+    return AccelerationRecord(observer, closed.tick, closed.accel_mps2, closed.variance)
+
+
+def rows_of(record: Record, layout: Layout) -> RowTable:
+    """The rows of a record of a sensor; raises `TypeError` for an acceleration, which is an input."""
+    slot = layout.slot(record.observer)
+    match record:
+        case PositionRecord():
+            rows = position_rows(
+                record.tick,
+                slot,
+                record.position_m,
+                record.variance_m2,
+                offset_s=record.offset_s,
+                half_width_m=record.half_width_m,
+            )
+            return _measured(rows, record.variance_m2)
+        case VelocityRecord():
+            rows = velocity_rows(
+                record.tick,
+                slot,
+                record.velocity_mps,
+                record.variance_m2ps2,
+                offset_s=record.offset_s,
+                half_width_mps=record.half_width_mps,
+            )
+            return _measured(rows, record.variance_m2ps2)
+        case SpeedRecord():
+            return speed_row(
+                record.tick,
+                slot,
+                record.speed_mps,
+                record.variance_m2ps2,
+                offset_s=record.offset_s,
+                half_width_mps=record.half_width_mps,
+            )
+        case RangeRecord():
+            return range_row(
+                record.tick,
+                slot,
+                layout.slot(record.other),
+                record.range_m,
+                record.variance_m2,
+                offset_s=record.offset_s,
+                half_width_m=record.half_width_m,
+            )
+        case AnchorRangeRecord():
+            return anchor_range_row(
+                record.tick,
+                slot,
+                record.anchor_m,
+                record.range_m,
+                record.variance_m2,
+                offset_s=record.offset_s,
+                half_width_m=record.half_width_m,
+            )
+        case AccelerationRecord():
+            raise TypeError(f"an acceleration is an input, not a measurement: {record}")
+
+
+def input_of(record: AccelerationRecord, layout: Layout) -> InputTable:
+    """The input of a record."""
+    return input_rows(record.tick, layout.slot(record.observer), record.accel_mps2, record.variance_m2ps4)
+
+
+def _measured(rows: RowTable, variance: Triple) -> RowTable:
+    """The rows of the axes that were measured (rounding on the wire only raises variances)."""
+    return rows[np.asarray(variance) < 0.99 * UNMEASURED_VARIANCE]

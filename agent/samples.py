@@ -1,0 +1,71 @@
+"""What sensors say, in SI units and NED, each with its own time on the fleet clock.
+
+Fleet time is seconds of UTC since the configured epoch. Adapters (MAVLink, UWB, logs) make these values;
+everything behind them knows neither protocol nor vendor.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+Triple = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+"""Unit quaternion ``(w, x, y, z)`` that rotates body FRD vectors into NED."""
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """Specific force in m/s2 (at rest ``(0, 0, -g)``) and turn rate in rad/s, both body FRD."""
+
+    t_s: float
+    specific_force_mps2: Triple
+    gyro_radps: Triple
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSample:
+    """Attitude of the body."""
+
+    t_s: float
+    quaternion: Quaternion
+
+
+@dataclass(frozen=True, slots=True)
+class GpsSample:
+    """A fix, with what the receiver says of its own accuracy (1-sigma per axis).
+
+    ``ground_velocity_mps`` (north, east) or ``speed_mps`` (norm of the velocity), whichever the receiver
+    gives; ``fix_type`` as in MAVLink (3 = 3-D).
+    """
+
+    t_s: float
+    position_m: Triple
+    horizontal_sigma_m: float
+    vertical_sigma_m: float
+    ground_velocity_mps: tuple[float, float] | None
+    speed_mps: float | None
+    speed_sigma_mps: float
+    fix_type: int
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSample:
+    """A range in m from agent ``observer`` to agent ``target``, 1-sigma in m."""
+
+    t_s: float
+    observer: int
+    target: int
+    range_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class AutopilotEstimate:
+    """The autopilot's own estimate about its own origin, NED m and m/s: to compare, never a measurement."""
+
+    t_s: float
+    position_m: Triple
+    velocity_mps: Triple
+
+
+Sample = ImuSample | AttitudeSample | GpsSample | RangeSample | AutopilotEstimate

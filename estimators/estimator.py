@@ -1,0 +1,121 @@
+"""The one interface of all estimators, and what goes in and out of it."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from enum import IntEnum
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.layout import Layout
+from estimators.measurements import InputTable, Matrix, RowTable, Vector
+
+
+class Status(IntEnum):
+    """How far an estimate can be trusted; never a NaN instead."""
+
+    OK = 0
+    NOT_CONVERGED = 1
+    """The last iterate is given."""
+    FELL_BACK = 2
+    """The solver failed: the pre-estimate (or the last good prediction) is given."""
+    NOT_OBSERVABLE = 3
+    NO_DATA = 4
+    """Nothing was measured or received: the prediction is given."""
+
+
+@dataclass(frozen=True, slots=True)
+class Payload:
+    """What one agent sends its neighbours in one consensus round (Borelle et al. 2023, eqs 11-12).
+
+    Attributes
+    ----------
+    tick : int
+        Tick of the state that the pair speaks of (start of the window for a moving horizon estimator).
+    information : Matrix ``(6n, 6n)``
+        Information matrix, symmetric positive definite.
+    vector : Vector ``(6n,)``
+        Information vector, ``information @ mean``.
+    rank : int
+        Rank of the regional observability matrix (25); the consensus weights follow from it.
+    degree : int
+        Number of neighbours the sender heard in the tick before; Metropolis weights follow from it.
+    """
+
+    tick: int
+    information: Matrix
+    vector: Vector
+    rank: int
+    degree: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class SolverReport:
+    """What the optimisation of one tick did."""
+
+    iterations: int = 0
+    qp_solves: int = 0
+    cost: float = 0.0
+    """Optimal value of (9), without the factor one half."""
+    active_bounds: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Estimate:
+    """The fleet as one agent sees it at one tick.
+
+    ``mean`` ``(6n,)`` and ``covariance`` ``(6n, 6n)`` in NED m and m/s, blocks in the order of the layout;
+    ``age_ticks`` ``(n,)``: ticks since anything measured by that agent last entered this estimate.
+    """
+
+    tick: int
+    mean: Vector
+    covariance: Matrix
+    status: Status
+    age_ticks: NDArray[np.int64]
+    report: SolverReport = field(default_factory=SolverReport)
+
+
+class Estimator(Protocol):
+    """One agent's estimator; the same calls for all algorithms, in lockstep, replay and flight.
+
+    A tick is ``begin``, then for each consensus round l = 0..rounds-1 ``outgoing(l)`` and ``mix(l, ...)``,
+    then ``solve``. Ticks grow by one. Rows and inputs may belong to earlier ticks (late arrivals): they go
+    to their place in the window; older ones are counted in ``dropped`` and ignored.
+    """
+
+    layout: Layout
+
+    @property
+    def rounds(self) -> int:
+        """Consensus rounds per tick."""
+        ...
+
+    @property
+    def dropped(self) -> int:
+        """Rows and inputs that came too late for their place."""
+        ...
+
+    def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
+        """Open a tick with the regional measurements and the known inputs that arrived since the last."""
+        ...
+
+    def outgoing(self, round_: int) -> Payload:
+        """What neighbours get in this round."""
+        ...
+
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
+        """Fuse what neighbours sent in this round, by slot; a missing neighbour is left out."""
+        ...
+
+    def solve(self, budget: int | None = None) -> Estimate:
+        """The estimate of the tick, with at most ``budget`` iterations where the method iterates."""
+        ...
+
+
+def symmetrised(matrix: NDArray[Any]) -> Matrix:
+    """The symmetric part of a square matrix."""
+    return np.asarray(0.5 * (matrix + matrix.T), np.float64)

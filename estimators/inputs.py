@@ -1,0 +1,69 @@
+"""Accelerations of the fleet over the window's ticks: those that are known, and a guess for those that are not."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.measurements import Matrix, Vector
+
+HISTORY_TICKS = 50
+"""How far back accelerations are kept, to hold the last one and to learn how fast they change."""
+
+CHANGES_NEEDED = 3
+"""Known changes of an agent's acceleration before a held one is trusted more than none at all."""
+
+
+class InputHistory:
+    """Known accelerations per tick and agent; what arrives first counts.
+
+    An unknown one is zero with ``other_variance`` per axis, or, with ``hold``, the agent's last known one. Its
+    variance then grows with the square of the ticks it is held: by the mean square change per tick that the
+    agent's known accelerations show, and never beyond ``other_variance``. Everything follows from what is
+    stored, so that the order of arrival does not matter.
+    """
+
+    def __init__(self, agents: int, other_variance: float, *, hold: bool) -> None:
+        self._known: list[dict[int, tuple[Vector, Vector]]] = [{} for _ in range(agents)]
+        self._other_variance = other_variance
+        self._hold = hold
+
+    def insert(self, tick: int, slot: int, accel: Vector, variance: Vector) -> None:
+        """Store an acceleration ``(3,)``, NED m/s2, over the tick that starts at ``tick``, and its variance."""
+        self._known[slot].setdefault(tick, (accel.copy(), variance.copy()))
+
+    def forget_before(self, tick: int) -> None:
+        """Drop what is older than ``tick`` (with ``hold``, older than the history)."""
+        limit = tick - (HISTORY_TICKS if self._hold else 0)
+        for known in self._known:
+            for old in [each for each in known if each < limit]:
+                del known[old]
+
+    def table(self, first: int, last: int) -> tuple[Matrix, Matrix]:
+        """Accelerations ``(last - first, 3n)`` over the ticks from ``first`` on, and their variances."""
+        ticks, n = last - first, len(self._known)
+        accel = np.zeros((ticks, 3 * n))
+        variance = np.full((ticks, 3 * n), self._other_variance)
+        for slot, known in enumerate(self._known):
+            columns = slice(3 * slot, 3 * slot + 3)
+            for k in range(ticks):
+                found = known.get(first + k) or (self._held(slot, first + k) if self._hold else None)
+                if found is not None:
+                    accel[k, columns], variance[k, columns] = found
+        return accel, variance
+
+    def _held(self, slot: int, tick: int) -> tuple[Vector, Vector] | None:
+        """The last acceleration known before ``tick``, with the variance of holding it."""
+        known = self._known[slot]
+        before = [each for each in known if each < tick]
+        change = self._mean_square_change(slot)
+        if not before or change is None:
+            return None
+        last = max(before)
+        accel, variance = known[last]
+        return accel, np.minimum(variance + change * (tick - last) ** 2, self._other_variance)
+
+    def _mean_square_change(self, slot: int) -> float | None:
+        """Mean square change per tick and axis of an agent's acceleration, its sensor's noise included."""
+        known = self._known[slot]
+        changes = [known[tick + 1][0] - accel for tick, (accel, _) in known.items() if tick + 1 in known]
+        return float(np.mean(np.square(changes))) if len(changes) >= CHANGES_NEEDED else None

@@ -1,0 +1,245 @@
+"""Measurement rows: what a sensor said, at which instant, how well, and how far off it can be at most.
+
+Every sensor reduces to scalar rows with independent noise (a correlated vector measurement is turned into
+its principal axes by the builders below), so one table serves the window, the filters and the wire.
+"""
+
+from __future__ import annotations
+
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+Vector = NDArray[np.float64]
+Matrix = NDArray[np.float64]
+RowTable = NDArray[np.void]
+"""Structured array of dtype `ROW`, one entry a scalar measurement."""
+InputTable = NDArray[np.void]
+"""Structured array of dtype `INPUT`, one entry the averaged acceleration of one agent over one tick."""
+
+
+class Kind(IntEnum):
+    """What a row measures; ``o`` is the row's ``offset_s``, ``p + v o`` the position at its own instant."""
+
+    POSITION = 0
+    """``direction . (p + v o)`` in m."""
+    VELOCITY = 1
+    """``direction . v`` in m/s."""
+    SPEED = 2
+    """``sqrt(|v|^2 + eps^2)`` in m/s."""
+    RANGE = 3
+    """``sqrt(|p_agent - p_other|^2 + eps^2)``, both at the row's instant, in m."""
+    ANCHOR_RANGE = 4
+    """``sqrt(|p_agent - anchor|^2 + eps^2)`` in m; the anchor is in ``x, y, z``."""
+
+
+ROW = np.dtype(
+    [
+        ("tick", np.int64),  # the tick the instant belongs to
+        ("offset_s", np.float64),  # instant minus the tick's time
+        ("value", np.float64),  # m or m/s
+        ("variance", np.float64),  # of the noise, unit of value squared
+        ("half_width", np.float64),  # hard bound on the noise; inf where the sensor has none
+        ("x", np.float64),  # unit direction (POSITION, VELOCITY) or anchor in NED m (ANCHOR_RANGE)
+        ("y", np.float64),
+        ("z", np.float64),
+        ("kind", np.int32),
+        ("agent", np.int32),  # slot of the agent measured
+        ("other", np.int32),  # slot of the range's other end, -1 otherwise
+        ("observer", np.int32),  # slot of the agent whose sensor it is
+    ],
+    align=True,
+)
+
+INPUT = np.dtype(
+    [
+        ("tick", np.int64),  # acts from this tick to the next
+        ("accel", np.float64, 3),  # NED m/s^2, gravity removed
+        ("variance", np.float64, 3),  # of its noise, (m/s^2)^2
+        ("agent", np.int32),  # slot
+    ],
+    align=True,
+)
+
+
+def empty_rows() -> RowTable:
+    """A table without rows."""
+    return np.zeros(0, ROW)
+
+
+def empty_inputs() -> InputTable:
+    """A table without inputs."""
+    return np.zeros(0, INPUT)
+
+
+def _rows(count: int, **columns: Any) -> RowTable:
+    rows = np.zeros(count, ROW)
+    rows["other"] = -1
+    for name, column in columns.items():
+        rows[name] = column
+    return rows
+
+
+def _principal_axes(
+    vector: ArrayLike, covariance: ArrayLike, half_width: ArrayLike
+) -> tuple[Matrix, Vector, Vector, Vector]:
+    """Directions (rows), values, variances and half widths of three independent scalar measurements.
+
+    A diagonal covariance (given as a vector of three variances or a diagonal matrix) keeps the NED axes and
+    its bounds. A full one is turned to its eigenvectors; a box bound in NED becomes the box that holds it.
+    """
+    value = np.asarray(vector, float)
+    cov = np.asarray(covariance, float)
+    half = np.broadcast_to(np.asarray(half_width, float), (3,))
+    if cov.ndim == 1 or not (cov - np.diag(np.diag(cov))).any():
+        return np.eye(3), value, np.array(cov if cov.ndim == 1 else np.diag(cov)), np.array(half)
+    variances, axes = np.linalg.eigh(cov)
+    directions = axes.T
+    with np.errstate(invalid="ignore"):  # 0 * inf: an absent bound stays absent
+        turned = np.abs(directions) @ half
+    return directions, directions @ value, variances, np.where(np.isfinite(turned), turned, np.inf)
+
+
+def position_rows(
+    tick: int,
+    agent: int,
+    position_m: ArrayLike,
+    covariance: ArrayLike,
+    *,
+    offset_s: float = 0.0,
+    half_width_m: ArrayLike = np.inf,
+    observer: int | None = None,
+) -> RowTable:
+    """Rows of a position fix ``(3,)`` NED m with covariance ``(3, 3)`` or variances ``(3,)``."""
+    direction, value, variance, half = _principal_axes(position_m, covariance, half_width_m)
+    return _vector_rows(Kind.POSITION, tick, agent, offset_s, observer, direction, value, variance, half)
+
+
+def velocity_rows(
+    tick: int,
+    agent: int,
+    velocity_mps: ArrayLike,
+    covariance: ArrayLike,
+    *,
+    offset_s: float = 0.0,
+    half_width_mps: ArrayLike = np.inf,
+    observer: int | None = None,
+) -> RowTable:
+    """Rows of a velocity vector ``(3,)`` NED m/s with covariance ``(3, 3)`` or variances ``(3,)``."""
+    direction, value, variance, half = _principal_axes(velocity_mps, covariance, half_width_mps)
+    return _vector_rows(Kind.VELOCITY, tick, agent, offset_s, observer, direction, value, variance, half)
+
+
+def _vector_rows(
+    kind: Kind,
+    tick: int,
+    agent: int,
+    offset_s: float,
+    observer: int | None,
+    direction: Matrix,
+    value: Vector,
+    variance: Vector,
+    half_width: Vector,
+) -> RowTable:
+    return _rows(
+        3,
+        kind=kind,
+        tick=tick,
+        offset_s=offset_s,
+        value=value,
+        variance=variance,
+        half_width=half_width,
+        x=direction[:, 0],
+        y=direction[:, 1],
+        z=direction[:, 2],
+        agent=agent,
+        observer=agent if observer is None else observer,
+    )
+
+
+def speed_row(
+    tick: int,
+    agent: int,
+    speed_mps: float,
+    variance: float,
+    *,
+    offset_s: float = 0.0,
+    half_width_mps: float = np.inf,
+) -> RowTable:
+    """The row of a speed norm in m/s (second line of Borelle et al. 2023, eq. 28)."""
+    return _rows(
+        1,
+        kind=Kind.SPEED,
+        tick=tick,
+        offset_s=offset_s,
+        value=speed_mps,
+        variance=variance,
+        half_width=half_width_mps,
+        agent=agent,
+        observer=agent,
+    )
+
+
+def range_row(
+    tick: int,
+    observer: int,
+    target: int,
+    range_m: float,
+    variance: float,
+    *,
+    offset_s: float = 0.0,
+    half_width_m: float = np.inf,
+) -> RowTable:
+    """The row of a range in m between two agents, measured by ``observer`` (Borelle et al. 2023, eq. 29)."""
+    return _rows(
+        1,
+        kind=Kind.RANGE,
+        tick=tick,
+        offset_s=offset_s,
+        value=range_m,
+        variance=variance,
+        half_width=half_width_m,
+        agent=observer,
+        other=target,
+        observer=observer,
+    )
+
+
+def anchor_range_row(
+    tick: int,
+    agent: int,
+    anchor_m: ArrayLike,
+    range_m: float,
+    variance: float,
+    *,
+    offset_s: float = 0.0,
+    half_width_m: float = np.inf,
+) -> RowTable:
+    """The row of a range in m to a fixed anchor at ``anchor_m`` ``(3,)``, NED m."""
+    anchor = np.asarray(anchor_m, float)
+    return _rows(
+        1,
+        kind=Kind.ANCHOR_RANGE,
+        tick=tick,
+        offset_s=offset_s,
+        value=range_m,
+        variance=variance,
+        half_width=half_width_m,
+        x=anchor[0],
+        y=anchor[1],
+        z=anchor[2],
+        agent=agent,
+        observer=agent,
+    )
+
+
+def input_rows(tick: int, agent: int, accel_mps2: ArrayLike, variance: ArrayLike) -> InputTable:
+    """The averaged acceleration ``(3,)`` of one agent over the tick that starts at ``tick``."""
+    table = np.zeros(1, INPUT)
+    table["tick"] = tick
+    table["agent"] = agent
+    table["accel"] = np.asarray(accel_mps2, float)
+    table["variance"] = np.broadcast_to(np.asarray(variance, float), (3,))
+    return table

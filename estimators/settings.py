@@ -1,0 +1,72 @@
+"""The ``[estimator]`` table of a configuration: which estimator runs, and how."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf"]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+Count = Annotated[int, msgspec.Meta(ge=1)]
+
+
+class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Settings of one estimator; every agent of a fleet runs the same."""
+
+    kind: Kind = "dmhe_pre_ekf"
+    """Algorithm."""
+
+    window: Annotated[int, msgspec.Meta(ge=1, le=64)] = 2
+    """Horizon N in ticks (moving horizon estimators; DEKF-CI takes its observability rank over it)."""
+
+    rounds: Annotated[int, msgspec.Meta(ge=0, le=16)] = 1
+    """Consensus rounds L per tick."""
+
+    weights: Literal["observability_rank", "metropolis", "uniform"] = "observability_rank"
+    """Consensus weights over the closed neighbourhood: Borelle et al. 2023, (24)-(26), or a classic."""
+
+    share_inputs: Literal["none", "neighbours", "fleet"] = "none"
+    """Whose tick-averaged acceleration an agent uses besides its own."""
+
+    relay_hops: Annotated[int, msgspec.Meta(ge=0, le=8)] = 0
+    """How many hops measurement records travel beyond their owner's neighbours (0 = none)."""
+
+    other_accel_variance: Positive = 4.0 / 3.0
+    """Variance, (m/s2)2 per axis, of an acceleration that is not known; 4/3 is uniform in +-2 m/s2."""
+
+    unknown_inputs: Literal["zero", "hold"] = "zero"
+    """What stands for an acceleration that is not known: zero, or the last one heard from that agent."""
+
+    norm_smoothing_m: Positive = 1e-3
+    """eps of the smoothed norms sqrt(|.|^2 + eps^2), in m for ranges and m/s for speeds."""
+
+    noise_bounds: Literal["off", "soft"] = "off"
+    """Whether the sensors' hard noise bounds enter the optimisation; an exact penalty is on their excess."""
+
+    noise_bounds_on: Literal["corrected", "predicted"] = "corrected"
+    """Residual that the bounds hold for: after the gain's correction, or the innovation (8) of the paper."""
+
+    noise_bounds_penalty: Positive = 100.0
+    """Cost per half width of excess; the cost (9) has no factor one half."""
+
+    state_box_position_m: Positive | None = None
+    """Hard bound on every position component of every state in the window; absent = none."""
+
+    state_box_speed_mps: Positive | None = None
+    """Hard bound on every velocity component of every state in the window; absent = none."""
+
+    reciprocal_ranges: Literal["independent", "shared"] = "independent"
+    """Ranges a->b and b->a of one tick: two measurements, or one exchange seen from both ends, fused once."""
+
+    iterations_ekf: Count = 1
+    """Updates per tick of the centralised EKF; 1 is the plain one, more the iterated one."""
+
+    qp: Literal["osqp", "daqp"] = "osqp"
+    """Engine of the constrained step."""
+
+    max_iterations: Annotated[int, msgspec.Meta(ge=1, le=10_000)] = 100
+    """Gauss-Newton iterations per tick at most."""
+
+    tolerance: Positive = 1e-6
+    """Convergence: largest change of a state component, m or m/s, still expected from another iteration."""

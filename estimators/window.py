@@ -1,0 +1,152 @@
+"""The measurement window: rows and inputs of the last N+1 ticks, in one order whatever order they came in."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import numpy as np
+
+from estimators.inputs import InputHistory
+from estimators.layout import Layout
+from estimators.measurements import (
+    INPUT,
+    ROW,
+    InputTable,
+    Kind,
+    Matrix,
+    RowTable,
+    empty_rows,
+)
+from estimators.row_kernels import IntArray
+
+_SORT_KEYS = ("z", "y", "x", "offset_s", "other", "agent", "kind", "observer", "tick")
+"""Least significant first, as `numpy.lexsort` takes them. Together they identify a record."""
+
+_IDENTITY = tuple(reversed(_SORT_KEYS))
+
+
+class MeasurementWindow:
+    """Rows and inputs of ticks ``first..last``.
+
+    A row is identified by tick, instant, sensor and observer; the same record twice (a repeated packet, a
+    relay) is kept once. What is older than the window is dropped, what is newer waits for its tick; what
+    cannot be used (not finite, no positive variance, an agent outside the fleet) is refused. All are counted.
+    """
+
+    def __init__(
+        self,
+        layout: Layout,
+        ticks: int,
+        *,
+        other_accel_variance: float,
+        reciprocal_ranges: Literal["independent", "shared"] = "independent",
+        unknown_inputs: Literal["zero", "hold"] = "zero",
+    ) -> None:
+        self.layout = layout
+        self.ticks = ticks
+        self.first = 0
+        self.last = -1
+        self.dropped = 0
+        """Rows and inputs that came too late for their place in the window."""
+        self.refused = 0
+        """Rows and inputs that no estimator could use."""
+        self._shared = reciprocal_ranges == "shared"
+        self._rows = empty_rows()
+        self._inputs = InputHistory(layout.size, other_accel_variance, hold=unknown_inputs == "hold")
+        self._origin: int | None = None
+        self._last_heard = np.full(layout.size, np.iinfo(np.int64).min, np.int64)
+
+    def advance(self, tick: int) -> None:
+        """Move the end of the window to ``tick``; what falls out at the start is forgotten."""
+        self.last = tick
+        if self._origin is None:
+            self._origin = tick
+        self.first = max(self.first, tick - self.ticks)
+        if len(self._rows) and self._rows["tick"][0] < self.first:
+            self._rows = self._rows[self._rows["tick"] >= self.first]
+        self._inputs.forget_before(self.first)
+
+    def insert(self, rows: RowTable, inputs: InputTable) -> None:
+        """Put rows and inputs to their places."""
+        self._insert_inputs(inputs)
+        if not len(rows):
+            return
+        rows = np.asarray(rows, ROW)
+        usable = self._usable(rows)
+        timely = rows["tick"] >= self.first
+        self.refused += int(np.count_nonzero(~usable))
+        self.dropped += int(np.count_nonzero(usable & ~timely))
+        kept = rows[usable & timely]
+        if not len(kept):
+            return
+        np.maximum.at(self._last_heard, kept["observer"], kept["tick"])
+        merged = np.concatenate([self._rows, kept])
+        merged = merged[np.lexsort([merged[key] for key in _SORT_KEYS])]
+        self._rows = merged[_first_of_each(merged)]
+
+    def _usable(self, rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+        n = self.layout.size
+        ok = np.isfinite(rows["offset_s"]) & np.isfinite(rows["value"]) & np.isfinite(rows["variance"])
+        ok &= (rows["variance"] > 0) & (rows["half_width"] > 0)
+        ok &= np.isfinite(rows["x"]) & np.isfinite(rows["y"]) & np.isfinite(rows["z"])
+        ok &= (rows["agent"] >= 0) & (rows["agent"] < n) & (rows["observer"] >= 0) & (rows["observer"] < n)
+        between = rows["kind"] == Kind.RANGE
+        ok &= np.where(
+            between,
+            (rows["other"] >= 0) & (rows["other"] < n) & (rows["other"] != rows["agent"]),
+            rows["other"] == -1,
+        )
+        ok &= (rows["kind"] >= 0) & (rows["kind"] <= max(Kind))
+        return np.asarray(ok)
+
+    def _insert_inputs(self, inputs: InputTable) -> None:
+        for sample in np.asarray(inputs, INPUT):
+            tick, slot = int(sample["tick"]), int(sample["agent"])
+            finite = np.isfinite(sample["accel"]).all() and np.isfinite(sample["variance"]).all()
+            if not finite or (sample["variance"] <= 0).any() or not 0 <= slot < self.layout.size:
+                self.refused += 1
+            elif tick < self.first:
+                self.dropped += 1
+            else:
+                self._inputs.insert(tick, slot, sample["accel"], sample["variance"])
+
+    def rows(self) -> tuple[RowTable, IntArray]:
+        """Rows up to the window's last tick, sorted, and the first row of each tick ``(N+2,)``."""
+        rows = self._rows
+        if self._shared:
+            rows = rows[~_seen_from_other_end(rows)]
+        start = np.searchsorted(rows["tick"], np.arange(self.first, self.last + 2))
+        return rows[: start[-1]], start.astype(np.int64)
+
+    def inputs(self) -> tuple[Matrix, Matrix]:
+        """Accelerations ``(N, 3n)`` over the window's ticks and their variances, see `InputHistory`."""
+        return self._inputs.table(self.first, self.last)
+
+    def hear(self, slot: int, tick: int) -> None:
+        """Note that information of an agent reached this one by another way than rows."""
+        self._last_heard[slot] = max(int(self._last_heard[slot]), tick)
+
+    def ages(self) -> IntArray:
+        """Ticks ``(n,)`` since anything that an agent observed entered; where nothing did, since before the start."""
+        before = -1 if self._origin is None else self._origin - 1
+        return np.asarray(self.last - np.maximum(self._last_heard, before))
+
+
+def _first_of_each(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Which of the sorted rows are the first of their identity."""
+    first = np.zeros(len(rows), np.bool_)
+    first[:1] = True
+    for key in _IDENTITY:
+        first[1:] |= rows[key][1:] != rows[key][:-1]
+    return first
+
+
+def _seen_from_other_end(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
+    """Ranges whose exchange is in the table from its lower end too: one exchange, one measurement."""
+    between = np.flatnonzero(rows["kind"] == Kind.RANGE)
+    drop = np.zeros(len(rows), np.bool_)
+    agent, other, tick = rows["agent"][between], rows["other"][between], rows["tick"][between]
+    lower = {(int(t), int(a), int(b)) for t, a, b in zip(tick, agent, other, strict=True) if a < b}
+    for at, t, a, b in zip(between, tick, agent, other, strict=True):
+        drop[at] = a > b and (int(t), int(b), int(a)) in lower
+    return drop

@@ -1,0 +1,1 @@
+"""Studies behind ``fleetloc bench``: what is measured, against what, and how it is shown."""

@@ -1,0 +1,419 @@
+"""The agent core in virtual time: alone, in a fleet, under loss, faults, gaps and wrong clocks."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+import numpy as np
+import pytest
+
+from agent.config_tables import FleetConfig
+from agent.core import AgentCore
+from agent.outputs import EstimateReady, Send
+from agent.samples import GpsSample, ImuSample, RangeSample
+from estimators.estimator import Estimate, Payload, Status
+from estimators.factory import make_estimator
+from estimators.layout import Layout
+from estimators.measurements import InputTable, Matrix, RowTable, Vector
+from estimators.settings import EstimatorSettings
+from transport.header import Kind
+from transport.information_body import Information
+from transport.measurement_body import Measurements, PositionRecord
+from transport.opening import Received
+from transport.sealing import Sealer
+
+MakeConfig = Callable[..., FleetConfig]
+Fleet = Any
+"""The `VirtualFleet` of conftest.py."""
+
+
+class Notebook:
+    """An estimator that notes its calls and answers with its prior; ``fail`` says what goes wrong when."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        layout: Layout,
+        slot: int,
+        mean: Vector,
+        covariance: Matrix,
+        period_s: float,
+    ) -> None:
+        self.layout, self.rounds, self.dropped = layout, settings.rounds, 0
+        self.mean, self.covariance = mean, covariance
+        self.calls: list[tuple[Any, ...]] = []
+        self.tick = 0
+
+    fail: Callable[[str, int], None] = staticmethod(lambda call, tick: None)
+
+    def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
+        self.tick = tick
+        self.calls.append(("begin", tick, measurements, inputs))
+        self.fail("begin", tick)
+
+    def outgoing(self, round_: int) -> Payload:
+        return Payload(self.tick, np.linalg.inv(self.covariance), self.mean, 6)
+
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
+        self.calls.append(("mix", round_, tuple(received)))
+        self.fail("mix", self.tick)
+
+    def solve(self, budget: int | None = None) -> Estimate:
+        self.fail("solve", self.tick)
+        mean = np.full_like(self.mean, np.nan) if self.fail("nan", self.tick) else self.mean
+        ages = np.zeros(self.layout.size, np.int64)
+        return Estimate(self.tick, mean, self.covariance, Status.OK, ages)
+
+
+def received(sender: int, message: Any, now_s: float = 0.0) -> Received:
+    kind = Kind.MEAS if isinstance(message, Measurements) else Kind.INFO
+    return Received(sender, kind, 1, 0, now_s, message)
+
+
+def fix(t_s: float) -> GpsSample:
+    return GpsSample(t_s, (1.0, 2.0, 3.0), 0.3, 0.5, None, 1.0, 0.1, 3)
+
+
+def lone(make_config: MakeConfig, *overrides: str, count: int = 1) -> tuple[AgentCore, list[Notebook]]:
+    """A core with notebooks for estimators, in the order in which they were made."""
+    made: list[Notebook] = []
+
+    def factory(*arguments: Any) -> Notebook:
+        made.append(Notebook(*arguments))
+        return made[-1]
+
+    config = make_config(count, "initial.position_m=[0.0, 0.0, 0.0]", *overrides)
+    return AgentCore(config, 1, factory), made
+
+
+def tick_through(core: AgentCore, start_s: float, duration_s: float) -> list[Any]:
+    outputs = []
+    for step in range(round(duration_s / 0.01)):
+        outputs += core.advance(start_s + 0.01 * step)
+    return outputs
+
+
+# --- one core ----------------------------------------------------------------------------------------------
+
+
+def test_each_tick_is_begun_mixed_and_solved_once_in_order(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, "estimator.rounds=2")
+    outputs = tick_through(core, 100.0, 1.0)
+    calls = [call[:2] for call in made[0].calls]
+    expected = [[("begin", tick), ("mix", 0), ("mix", 1)] for tick in range(1000, 1009)]
+    assert calls == [call for tick in expected for call in tick]
+    sent = [type(o.message).__name__ for o in outputs if isinstance(o, Send)]
+    assert sent[:4] == ["Measurements", "Information", "Information", "FleetEstimate"]
+    ready = [o for o in outputs if isinstance(o, EstimateReady)]
+    assert [r.estimate.tick for r in ready] == list(range(1000, 1009))
+    assert all(r.on_time for r in ready)
+    assert ready[0].t_s == pytest.approx(100.0)
+
+
+def test_rows_of_a_tick_come_with_it_and_its_input_with_the_next(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    core.advance(100.0)
+    core.on_gps(fix(100.13), 100.18)
+    core.on_gps(fix(100.17), 100.18)
+    tick_through(core, 100.18, 0.4)
+    first, second, third, fourth, *_ = (call for call in made[0].calls if call[0] == "begin")
+    assert (first[1], len(first[2])) == (1000, 0)
+    assert (second[1], second[2]["tick"].tolist(), second[3]["tick"].tolist()) == (1001, [1001] * 4, [1000])
+    assert second[2]["offset_s"] == pytest.approx(0.03)
+    assert (third[1], third[2]["tick"].tolist(), third[3]["tick"].tolist()) == (1002, [1002] * 4, [1001])
+    assert third[2]["offset_s"] == pytest.approx(-0.03)  # it is nearer to the start of the next tick
+    assert (fourth[1], len(fourth[2])) == (1003, 0)
+
+
+def test_a_fix_that_comes_late_keeps_its_place(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    tick_through(core, 100.0, 0.5)
+    core.on_gps(fix(100.22), 100.5)
+    tick_through(core, 100.5, 0.2)
+    begun = {call[1]: call[2] for call in made[0].calls if call[0] == "begin"}
+    assert begun[1004]["tick"].tolist() == [1002] * 4
+
+
+def test_the_next_due_time_is_when_something_happens(make_config: MakeConfig) -> None:
+    core, _ = lone(make_config, count=2)
+    assert core.next_due_s() is None
+    assert core.advance(100.05) == []
+    due_s = core.next_due_s()
+    assert due_s == pytest.approx(100.11)
+    assert core.advance(due_s - 1e-6) == []
+    assert isinstance(next(iter(core.advance(due_s))), Send)
+
+
+def test_samples_of_wrong_times_are_counted_and_unused(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    core.advance(100.0)
+    core.on_gps(fix(90.0), 100.01)
+    core.on_gps(fix(102.0), 100.01)
+    core.on_gps(fix(float("nan")), 100.01)
+    core.on_imu(ImuSample(1e9, (0, 0, -9.8), (0, 0, 0)), 100.01)
+    core.on_range(RangeSample(100.0, 7, 1, 3.0, 0.1), 100.01)
+    tick_through(core, 100.01, 0.2)
+    assert len(made[0].calls[0][2]) == 0
+    assert (core.counters["gps: wrong time"], core.counters["imu: wrong time"]) == (3, 1)
+    assert core.counters["range: not ours"] == 1
+
+
+def test_after_a_long_sleep_the_ticks_between_are_left_out(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    tick_through(core, 100.0, 0.5)
+    outputs = tick_through(core, 200.0, 0.3)
+    ticks = [o.estimate.tick for o in outputs if isinstance(o, EstimateReady)]
+    assert ticks == [2000, 2001]
+    assert len(made) == 2
+    assert core.counters["ticks: left out"] == 1000 + 1000 - 1004
+
+
+def test_a_short_stall_is_made_up_tick_by_tick_and_reported_late(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    tick_through(core, 100.0, 0.5)
+    outputs = core.advance(102.0)
+    ready = [o for o in outputs if isinstance(o, EstimateReady)]
+    assert [r.estimate.tick for r in ready] == list(range(1004, 1019))
+    assert [r.on_time for r in ready] == [False] * 14 + [True]
+    assert core.counters["ticks: late"] == 14
+    assert len(made) == 1
+
+
+@pytest.mark.parametrize("call", ["begin", "mix", "solve"])
+def test_a_broken_estimator_falls_back_and_starts_anew(make_config: MakeConfig, call: str) -> None:
+    core, made = lone(make_config, count=2)
+
+    def fail(what: str, tick: int) -> None:
+        if (what, tick) == (call, 1003):
+            raise np.linalg.LinAlgError("singular")
+
+    core.advance(100.0)
+    tick_through(core, 100.0, 0.25)
+    made[0].fail = fail
+    made[0].mean[3] = 3.0
+    ready = [o for o in tick_through(core, 100.25, 0.5) if isinstance(o, EstimateReady)]
+    statuses = {r.estimate.tick: r.estimate.status for r in ready}
+    assert statuses[1003] is Status.FELL_BACK
+    assert all(status is Status.OK for tick, status in statuses.items() if tick != 1003)
+    assert len(made) == 2
+    fallen = next(r.estimate for r in ready if r.estimate.tick == 1003)
+    assert fallen.mean[:3] == pytest.approx([0.3, 0.0, 0.0])  # one tick further at 3 m/s
+    assert fallen.covariance[0, 0] == pytest.approx(made[0].covariance[0, 0] + 1.0)
+    assert core.counters["estimator faults"] == 1
+    assert isinstance(core.last_fault, np.linalg.LinAlgError)
+
+
+def test_an_estimate_that_is_not_finite_never_gets_out(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    tick_through(core, 100.0, 0.25)
+    made[0].fail = lambda what, tick: (what, tick) == ("nan", 1003)  # type: ignore[assignment,return-value]
+    ready = [o for o in tick_through(core, 100.25, 0.5) if isinstance(o, EstimateReady)]
+    assert all(np.isfinite(r.estimate.mean).all() for r in ready)
+    assert core.counters["estimator faults"] == 1
+
+
+def test_before_any_position_the_estimate_says_no_data(make_config: MakeConfig) -> None:
+    core = AgentCore(make_config(2), 1, Notebook)
+    ready = [o for o in tick_through(core, 100.0, 20.0) if isinstance(o, EstimateReady)]
+    assert {r.estimate.status for r in ready} == {Status.NO_DATA}
+    assert (ready[0].estimate.covariance.diagonal() >= 1e8).all()
+    assert str(core.health.health).startswith("init: waiting for fixes")
+
+
+# --- packets -----------------------------------------------------------------------------------------------
+
+
+def information(
+    tick: int, round_: int = 0, agents: tuple[int, ...] = (1, 2), state_tick: int | None = None
+) -> Information:
+    n = 6 * len(agents)
+    return Information(tick, round_, tick if state_tick is None else state_tick, 6, agents, np.eye(n), np.zeros(n))
+
+
+def test_measurements_are_waited_for_until_they_come_or_their_time_is_over(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, count=2)
+    core.advance(100.0)
+    core.on_packet(received(2, Measurements(999, ())), 100.01)
+    core.advance(100.115)
+    assert made == []  # neighbour 2 is heard, its tick 1000 is not there yet
+    core.on_packet(received(2, Measurements(1000, (PositionRecord(2, 1000, (1, 2, 3), (1, 1, 1)),))), 100.118)
+    core.advance(100.118)
+    assert made[0].calls[0][2]["agent"].tolist() == [1, 1, 1]
+    core.advance(100.2)
+    core.advance(100.225)
+    assert len(made[0].calls) == 2
+    assert core.advance(100.231) != []  # exchange deadline: 0.3 of the period after the end
+
+
+def test_a_neighbour_that_left_is_not_waited_for(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, count=2)
+    core.advance(100.0)
+    core.on_packet(received(2, Measurements(999, ())), 100.01)
+    core.advance(100.115)
+    core.on_gone(2)
+    core.advance(100.116)
+    assert made[0].calls[-1][:2] == ("mix", 0)
+
+
+def test_information_is_mixed_by_slot_in_its_round_and_late_counted(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, count=2)
+    core.advance(100.0)
+    core.on_packet(received(2, information(999)), 100.0)
+    core.on_packet(received(2, Measurements(1000, ())), 100.1)
+    core.on_packet(received(2, information(1000)), 100.11)
+    core.advance(100.115)
+    assert made[0].calls[-1] == ("mix", 0, (1,))
+    core.on_packet(received(2, information(1000)), 100.12)
+    assert core.counters["information: late"] >= 1
+
+
+def test_information_about_another_fleet_or_window_is_left_out(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, count=2)
+    core.advance(100.0)
+    core.on_packet(received(2, information(1000, agents=(2, 1))), 100.1)
+    core.on_packet(received(2, Measurements(1000, ())), 100.1)
+    core.on_packet(received(2, information(1000, state_tick=998)), 100.1)
+    core.advance(100.115)
+    assert made[0].calls[-1] == ("mix", 0, ())
+    assert core.counters["information: other agents"] == 1
+    assert core.counters["information: other window"] == 1
+
+
+def test_strangers_are_not_listened_to(make_config: MakeConfig) -> None:
+    core, _ = lone(make_config, "fleet.edges=[[1,2]]", count=3)
+    core.on_packet(received(3, Measurements(1000, ())), 100.0)
+    assert core.counters["packet: not a neighbour"] == 1
+
+
+def test_a_neighbour_with_a_wrong_clock_harms_nobody(make_config: MakeConfig) -> None:
+    core, made = lone(make_config, count=2)
+    core.advance(100.0)
+    for k in range(30):
+        now_s = 100.0 + 0.01 * k
+        wrong = 5000 + k
+        core.on_packet(received(2, Measurements(wrong, (PositionRecord(2, wrong, (1, 2, 3), (1, 1, 1)),))), now_s)
+        core.on_packet(received(2, information(wrong)), now_s)
+        core.advance(now_s)
+    assert core.records.refused["heard: of the future"] == 30
+    assert core.counters["information: wild"] == 30
+    assert [call[1] for call in made[0].calls if call[0] == "begin"] == [1000, 1001]
+    assert len(made[0].calls[0][2]) == 0
+
+
+# --- fleets ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf"])
+def test_a_fleet_finds_itself_and_stays_on_time(virtual_fleet: Fleet, make_config: MakeConfig, kind: str) -> None:
+    fleet = virtual_fleet(make_config(3, f"estimator.kind={kind}"))
+    fleet.run(8)
+    for agent_id in fleet.config.ids:
+        ready = fleet.estimates[agent_id]
+        assert [r.estimate.tick for r in ready] == list(range(10_000, 10_000 + len(ready)))
+        assert len(ready) >= 78
+        assert all(r.on_time for r in ready)
+        assert all(np.isfinite(r.estimate.covariance).all() for r in ready)
+        assert fleet.own_error_m(agent_id, skip=30).mean() < 0.25
+        assert fleet.health[agent_id][-1] == "ok"
+        assert fleet.cores[agent_id].counters["estimator faults"] == 0
+
+
+@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf", "dmhe"])
+def test_ticks_without_any_measurement_are_no_fault(make_config: MakeConfig, kind: str) -> None:
+    core = AgentCore(
+        make_config(2, f"estimator.kind={kind}", "initial.position_m=[1.0, 2.0, -3.0]"), 1, make_estimator
+    )
+    ready = [o for o in tick_through(core, 100.0, 2.0) if isinstance(o, EstimateReady)]
+    assert core.counters["estimator faults"] == 0
+    assert all(np.isfinite(r.estimate.mean).all() for r in ready)
+    sigma = [r.estimate.covariance[0, 0] for r in ready]
+    assert sigma == sorted(sigma)
+
+
+def test_the_same_run_twice_is_bit_equal(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    runs = []
+    for _ in range(2):
+        fleet = virtual_fleet(make_config(3))
+        fleet.run(3)
+        runs.append([r.estimate for i in fleet.config.ids for r in fleet.estimates[i]])
+    for first, second in zip(*runs, strict=True):
+        assert first.tick == second.tick
+        assert np.array_equal(first.mean, second.mean)
+        assert np.array_equal(first.covariance, second.covariance)
+
+
+def test_a_drone_without_gps_lives_on_its_neighbours(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    fleet = virtual_fleet(make_config(4), blind=lambda agent_id, t_s: agent_id == 4 and t_s > 1004)
+    fleet.run(12)
+    assert fleet.own_error_m(4)[60:].max() < 1.5
+    assert "no GPS" in fleet.health[4][-1]
+    assert fleet.health[1][-1] == "ok"
+
+
+def test_a_drone_that_never_had_gps_starts_from_its_neighbours(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    config = make_config(4, "initial.max_wait_s=2.0")
+    fleet = virtual_fleet(config, blind=lambda agent_id, t_s: agent_id == 4)
+    fleet.run(10)
+    statuses = [r.estimate.status for r in fleet.estimates[4]]
+    assert statuses[0] is Status.NO_DATA
+    assert 15 <= statuses.count(Status.NO_DATA) <= 25
+    assert np.median(fleet.own_error_m(4)[70:]) < 2.0
+
+
+def test_a_dead_neighbour_costs_no_tick_and_is_taken_back(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    fleet = virtual_fleet(make_config(3))
+    fleet.run(4)
+    del fleet.cores[2]
+    fleet.run(4)
+    assert "not heard: 2" in fleet.health[1][-1]
+    fleet.cores[2] = fleet.new_core(2)
+    fleet.sealers[2] = Sealer("test", 2, boot=2, signing=fleet.sealers[1]._signing)
+    fleet.run(4)
+    for survivor in (1, 3):
+        ready = fleet.estimates[survivor]
+        assert [r.estimate.tick for r in ready] == list(range(10_000, 10_000 + len(ready)))
+        assert all(r.on_time for r in ready)
+        assert fleet.health[survivor][-1] == "ok"
+        assert fleet.own_error_m(survivor, skip=30).max() < 1.0
+    assert fleet.own_error_m(2)[-10:].max() < 0.5
+
+
+def test_lost_packets_are_repaired_by_those_after_them(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    rng = np.random.default_rng(3)
+    fleet = virtual_fleet(
+        make_config(3, "estimator.kind=dmhe_pre_ekf", "estimator.window=4"), cut=lambda *_: rng.random() < 0.5
+    )
+    fleet.run(8)
+    for agent_id in fleet.config.ids:
+        assert all(r.on_time for r in fleet.estimates[agent_id])
+        assert fleet.own_error_m(agent_id, skip=30).mean() < 0.3
+        heard = fleet.cores[agent_id].records._seen
+        other = 1 if agent_id != 1 else 2
+        last = fleet.estimates[agent_id][-1].estimate.tick - 10
+        of_other = sum(any(name[1] == other for name in heard[tick]) for tick in range(last - 40, last))
+        assert of_other >= 36  # at 50 % loss single packets would have brought 20 of 40
+
+
+def test_a_partition_is_survived_and_healed(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    fleet = virtual_fleet(make_config(3), cut=lambda s, r, t_s: 1003 < t_s < 1007 and 1 in (s, r))
+    fleet.run(6.5)
+    assert "not heard: 2, 3" in fleet.health[1][-1]
+    fleet.run(3.5)
+    assert fleet.health[1][-1] == "ok"
+    for agent_id in fleet.config.ids:
+        assert all(r.on_time for r in fleet.estimates[agent_id])
+        assert fleet.own_error_m(agent_id, skip=30).mean() < 0.3
+
+
+def test_packets_later_than_their_tick_are_still_used(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+    config = make_config(3, "estimator.kind=dmhe_pre_ekf", "estimator.window=4")
+    fleet = virtual_fleet(config, delay_s=0.12)
+    fleet.run(6)
+    for agent_id, core in fleet.cores.items():
+        assert core.counters["measurements: late"] > 40
+        assert core.counters["information: late"] > 40
+        assert core.records.refused["heard: too old"] == 0
+        assert all(r.on_time for r in fleet.estimates[agent_id])
+        ages = fleet.estimates[agent_id][-1].estimate.age_ticks
+        assert 1 <= ages.max() <= 3

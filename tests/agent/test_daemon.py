@@ -1,0 +1,248 @@
+"""The daemon on loopback: real sockets, real Zenoh sessions, real signals; every wait has an end."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import signal
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent.config import dump
+from agent.config_tables import FleetConfig
+from agent.daemon import Daemon, run
+from agent.exit_codes import ExitCode
+from agent.logs import configure_logging
+from agent.recording import read_record
+from estimators.estimator import Status
+from estimators.factory import make_estimator
+from transport.keys import init_keys
+
+HOST = "127.0.0.1"
+PATIENCE_S = 30.0
+
+
+@contextmanager
+def bound(kind: int) -> Iterator[int]:
+    """A port that is taken."""
+    with socket.socket(socket.AF_INET, kind) as taken:
+        taken.bind((HOST, 0))
+        if kind == socket.SOCK_STREAM:
+            taken.listen()
+        yield taken.getsockname()[1]
+
+
+def free_ports(kind: int, count: int) -> list[int]:
+    with ExitStack() as stack:
+        return [stack.enter_context(bound(kind)) for _ in range(count)]
+
+
+@pytest.fixture
+def config_of(make_config: Callable[..., FleetConfig], tmp_path: Path) -> Callable[..., FleetConfig]:
+    """A fleet on free ports, whose agents start at once."""
+
+    def make(count: int, *overrides: str) -> FleetConfig:
+        udp, tcp = free_ports(socket.SOCK_DGRAM, count), free_ports(socket.SOCK_STREAM, count)
+        own: list[str] = ["initial.position_m=[0.0, 0.0, -5.0]", f"record.directory={tmp_path / 'rec'}"]
+        for i in range(count):
+            own.append(f"agents.{i + 1}.mavlink=udpin:{HOST}:{udp[i]}")
+            own.append(f'agents.{i + 1}.listen=["tcp/{HOST}:{tcp[i]}"]')
+        if count > 1:
+            own.append(f'agents.2.connect=["tcp/{HOST}:{tcp[0]}"]')
+        return make_config(count, *own, *overrides)
+
+    return make
+
+
+# --- ends ----------------------------------------------------------------------------------------------------
+
+
+def expect_exit(
+    config: FleetConfig, agent_id: int, caplog: pytest.LogCaptureFixture, base: Path = Path()
+) -> tuple[ExitCode, str]:
+    """The exit code, and the one line that explains it."""
+    with caplog.at_level(logging.ERROR, "fleetloc.agent"):
+        code = run(config, agent_id, make_estimator, base=base)
+    assert len(caplog.messages) == 1
+    assert "\n" not in caplog.messages[0]
+    return code, caplog.messages[0]
+
+
+def test_an_unknown_id_is_a_configuration_error(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
+    code, line = expect_exit(config_of(2), 7, caplog)
+    assert code is ExitCode.CONFIG
+    assert "expected one of 1, 2, found 7" in line
+
+
+def test_a_taken_mavlink_port(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
+    with bound(socket.SOCK_DGRAM) as port:
+        code, line = expect_exit(config_of(1, f"agents.1.mavlink=udpin:{HOST}:{port}"), 1, caplog)
+    assert code is ExitCode.LINK
+    assert f"udpin:{HOST}:{port}: cannot be opened" in line
+
+
+def test_a_taken_session_port(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
+    with bound(socket.SOCK_STREAM) as port:
+        code, line = expect_exit(config_of(1, f'agents.1.listen=["tcp/{HOST}:{port}"]'), 1, caplog)
+    assert code is ExitCode.SESSION
+    assert f"tcp/{HOST}:{port}" in line
+
+
+def test_missing_keys(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    code, line = expect_exit(config_of(1, "security.mode=signed"), 1, caplog, tmp_path)
+    assert code is ExitCode.KEYS
+    assert str(tmp_path / "keys") in line
+    assert "fleetloc keys" in line
+
+
+def test_a_record_that_cannot_be_written(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    code, line = expect_exit(config_of(1, f"record.directory={tmp_path / 'file'}"), 1, caplog)
+    assert code is ExitCode.RECORD
+    assert "cannot be written" in line
+
+
+def test_an_autopilot_that_never_appears(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
+    code, line = expect_exit(config_of(1, "mavlink.appear_timeout_s=0.2", "fleet.period_s=1.0"), 1, caplog)
+    assert code is ExitCode.NO_AUTOPILOT
+    assert "expected heartbeats of an autopilot (auto) with system id 1 within 0.2 s, found nothing" in line
+
+
+def test_log_lines_go_to_stderr_quiet_unless_asked(capsys: pytest.CaptureFixture[str]) -> None:
+    logger = logging.getLogger("fleetloc")
+    before = (logger.handlers[:], logger.level, logger.propagate)
+    try:
+        configure_logging(0)
+        logging.getLogger("fleetloc.agent").info("a state")
+        configure_logging(1)
+        logging.getLogger("fleetloc.agent").info("a change")
+        out, err = capsys.readouterr()
+    finally:
+        logger.handlers[:], logger.level, logger.propagate = before
+    assert out == ""
+    assert "a change" in err
+    assert "a state" not in err
+
+
+# --- life ----------------------------------------------------------------------------------------------------
+
+
+class UdpAutopilot(asyncio.DatagramProtocol):
+    """A virtual autopilot that streams to a daemon in real time until it is cancelled."""
+
+    def __init__(self, virtual: Any, remote: str) -> None:
+        self.virtual = virtual
+        host, port = remote.removeprefix("udpin:").split(":")
+        self.remote = (host, int(port))
+
+    def datagram_received(self, data: bytes, addr: Any) -> None:
+        self.virtual.receive(data, time.monotonic())
+
+    async def fly(self) -> None:
+        loop = asyncio.get_running_loop()
+        transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=self.remote)
+        try:
+            while True:
+                for frame in self.virtual.step(time.monotonic()):
+                    transport.sendto(frame)
+                await asyncio.sleep(0.005)  # the autopilot's own pace, not a wait of the test
+        finally:
+            transport.close()
+
+
+async def until(condition: Callable[[], bool], what: str) -> None:
+    async def poll() -> None:
+        while not condition():
+            await asyncio.sleep(0.01)
+
+    try:
+        await asyncio.wait_for(poll(), PATIENCE_S)
+    except TimeoutError:
+        pytest.fail(f"in {PATIENCE_S:g} s not seen: {what}")
+
+
+async def test_two_daemons_find_their_autopilots_and_each_other(
+    config_of: Any, virtual_autopilot: type[Any], tmp_path: Path
+) -> None:
+    init_keys(tmp_path / "keys", (1, 2))
+    config = config_of(2, "security.mode=signed")
+    daemons = [Daemon(config, i, make_estimator, tmp_path) for i in (1, 2)]
+    flown = [
+        UdpAutopilot(virtual_autopilot(system_id=i, boot_s=time.monotonic() - 50), config.agent(i).mavlink)
+        for i in (1, 2)
+    ]
+    flights = [asyncio.create_task(autopilot.fly()) for autopilot in flown]
+    runs = [asyncio.create_task(daemon.run()) for daemon in daemons]
+    await until(lambda: all(d.core.health.health.state == "ok" for d in daemons), "both ok")
+    await until(lambda: all(d.core.counters["information: kept"] > 5 for d in daemons), "rounds of both")
+    await until(lambda: bool(daemons[0].radio.opener.peers[2].clock.round_trip_s), "a clock answer")
+    daemons[1].stop()
+    await asyncio.wait_for(runs[1], PATIENCE_S)
+    await until(lambda: "not heard: 2" in str(daemons[0].core.health.health), "2 has left")
+    flights[0].cancel()  # the autopilot is gone; the daemon goes on
+    ticks = daemons[0].core.counters["ticks"]
+    await until(lambda: daemons[0].core.autopilot_state == "lost", "the lost autopilot")
+    assert daemons[0].core.counters["ticks"] > ticks
+    daemons[0].stop()
+    await asyncio.wait_for(runs[0], PATIENCE_S)
+    for flight in flights:
+        flight.cancel()
+    await asyncio.gather(*flights, return_exceptions=True)
+    check_records(tmp_path / "rec")
+
+
+def check_records(directory: Path) -> None:
+    for agent_id in (1, 2):
+        header, entries = read_record(directory / f"agent_{agent_id:03d}.estimates")
+        assert (header.agent, header.agents) == (agent_id, (1, 2))
+        assert (entries["tick"][1:] - entries["tick"][:-1] == 1).all()
+        assert (entries["status"] == Status.OK).any()
+        summary = json.loads((directory / f"agent_{agent_id:03d}.json").read_text())
+        assert summary["counters"]["packets received"] > 10
+        assert summary["counters"]["program faults"] == 0
+        assert 0 < summary["gauges"]["rss_mb"] < 1000
+        assert summary["gauges"]["tick_time_p50_s"] < 0.1
+
+
+SCRIPT = """
+import sys
+from agent.config import load_config
+from agent.daemon import run
+from agent.logs import configure_logging
+from estimators.factory import make_estimator
+from transport.keys import init_keys
+configure_logging(1)
+sys.exit(run(load_config(sys.argv[1]), 1, make_estimator))
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
+async def test_a_signal_ends_the_process_cleanly(config_of: Any, tmp_path: Path, number: int) -> None:
+    path = tmp_path / "fleet.toml"
+    path.write_text(dump(config_of(1)))
+    process = await asyncio.create_subprocess_exec(
+        sys.executable,
+        "-c",
+        SCRIPT,
+        str(path),
+        stderr=asyncio.subprocess.PIPE,
+        env={**os.environ, "PYTHONPATH": str(Path(__file__).parents[2])},
+    )
+    assert process.stderr is not None
+    first = await asyncio.wait_for(process.stderr.readline(), PATIENCE_S)
+    assert b"listening on udpin:127.0.0.1" in first
+    await asyncio.wait_for(process.stderr.readline(), PATIENCE_S)  # its first state: it runs
+    process.send_signal(number)
+    _, rest = await asyncio.wait_for(process.communicate(), PATIENCE_S)
+    assert process.returncode == ExitCode.OK
+    assert b"Traceback" not in rest
+    assert (tmp_path / "rec" / "agent_001.json").exists()

@@ -1,0 +1,258 @@
+"""The fleet clock, the health, the record, the start: small parts that everything stands on."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.clock import FleetClock
+from agent.config_tables import FleetConfig
+from agent.errors import RecordError
+from agent.health import Facts, Health, HealthMonitor, State, assess
+from agent.initial import Initialiser
+from agent.outputs import EstimateReady, estimate_message
+from agent.recording import (
+    EstimateRecorder,
+    RecordHeader,
+    covariance_of,
+    entry_dtype,
+    read_record,
+    write_summary,
+)
+from agent.warmup import warm_up
+from estimators.estimator import Estimate, Status
+from estimators.factory import make_estimator
+from transport.measurement_body import PositionRecord, RangeRecord, VelocityRecord
+
+MakeConfig = Callable[..., FleetConfig]
+
+# --- clock -------------------------------------------------------------------------------------------------
+
+
+def test_small_differences_are_slewed_and_time_never_goes_back() -> None:
+    clock = FleetClock(1000.0, unix_s=5000.0, host_s=10.0)
+    assert clock.fleet_s(10.0) == 4000.0
+    last = 0.0
+    for step in range(1, 300):
+        host_s = 10.0 + step
+        assert not clock.sync(unix_s=4990.0 + host_s - 0.2, host_s=host_s)
+        assert clock.fleet_s(host_s) > last
+        last = clock.fleet_s(host_s)
+    assert clock.fleet_s(309.0) == pytest.approx(4299.0 - 0.2, abs=1e-9)
+    assert clock.steps == 0
+
+
+@given(st.floats(0.6, 1e6), st.booleans())
+def test_a_step_of_utc_is_followed_at_once_and_said(size_s: float, forward: bool) -> None:
+    clock = FleetClock(0.0, unix_s=2e6, host_s=0.0)
+    jumped = 2e6 + 1.0 + (size_s if forward else -size_s)
+    assert clock.sync(unix_s=jumped, host_s=1.0)
+    assert clock.fleet_s(1.0) == pytest.approx(jumped)
+    assert clock.steps == 1
+
+
+# --- health ------------------------------------------------------------------------------------------------
+
+
+def facts(**changed: Any) -> Facts:
+    good: dict[str, Any] = {
+        "status": Status.OK, "own_sigma_m": 0.1, "gps_age_s": 0.2, "imu_coverage": 1.0,
+        "silent_neighbours": (), "autopilot": "connected",
+    }  # fmt: skip
+    return Facts(**{**good, **changed})
+
+
+@pytest.mark.parametrize(
+    ("changed", "was", "expected"),
+    [
+        ({}, State.OK, Health(State.OK, ())),
+        ({"status": None, "waiting_for": "fixes"}, State.INIT, Health(State.INIT, ("fixes",))),
+        ({"own_sigma_m": 3.0}, State.INIT, Health(State.ALIGNING, ())),
+        ({"own_sigma_m": 3.0}, State.OK, Health(State.OK, ())),
+        ({"own_sigma_m": 6.0}, State.OK, Health(State.DEGRADED, ("position uncertain",))),
+        ({"own_sigma_m": 60.0}, State.OK, Health(State.FAULT, ("position unknown",))),
+        ({"gps_age_s": 2.0}, State.OK, Health(State.DEGRADED, ("no GPS",))),
+        ({"gps_age_s": None}, State.OK, Health(State.DEGRADED, ("no GPS",))),
+        ({"imu_coverage": 0.5}, State.OK, Health(State.DEGRADED, ("IMU incomplete",))),
+        ({"silent_neighbours": (2, 5)}, State.OK, Health(State.DEGRADED, ("not heard: 2, 5",))),
+        ({"autopilot": "lost"}, State.OK, Health(State.DEGRADED, ("autopilot lost",))),
+        ({"status": Status.FELL_BACK}, State.OK, Health(State.DEGRADED, ("estimate fell back",))),
+        ({"status": Status.NOT_CONVERGED}, State.OK, Health(State.OK, ())),
+    ],
+)
+def test_the_state_and_its_reasons_follow_from_the_facts(
+    changed: dict[str, Any], was: State, expected: Health
+) -> None:
+    assert assess(facts(**changed), was) == expected
+
+
+def test_a_flapping_state_is_reported_once_a_second_and_the_last_word_comes_through() -> None:
+    monitor, reported = HealthMonitor(), []
+    for step in range(500):
+        now_s = 100.0 + 0.01 * step
+        flapping = step < 400 and step % 2
+        health = monitor.update(facts(gps_age_s=9.0 if flapping else 0.1), now_s)
+        if health is not None:
+            reported.append(health)
+    assert 2 <= len(reported) <= 6
+    assert monitor.changes > 300
+    assert reported[-1].state is monitor.health.state is State.OK
+
+
+# --- record ------------------------------------------------------------------------------------------------
+
+HEADER = RecordHeader(fleet="test", agent=1, agents=(1, 2), period_s=0.1, epoch_unix_s=5.0)
+
+
+def ready(tick: int, seed: int = 0) -> EstimateReady:
+    rng = np.random.default_rng(seed)
+    half = rng.normal(size=(12, 12))
+    estimate = Estimate(tick, rng.normal(size=12), half @ half.T, Status.OK, np.array([0, 3]))
+    return EstimateReady(estimate, tick * 0.1, tick * 0.1 + 0.12, True)
+
+
+def test_a_record_is_read_back_as_it_was_written(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "agent_001.estimates"
+    recorder = EstimateRecorder(path, HEADER, 10**6)
+    for tick in range(20):
+        recorder.write(ready(tick, tick), 0.1 * tick + 0.13, 0.002)
+    recorder.close()
+    header, entries = read_record(path)
+    assert header == HEADER
+    assert entries["tick"].tolist() == list(range(20))
+    assert entries["published_s"] == pytest.approx(0.1 * np.arange(20) + 0.13)
+    assert (entries[7]["mean"] == ready(7, 7).estimate.mean).all()
+    assert covariance_of(entries[7], 2) == pytest.approx(ready(7, 7).estimate.covariance)
+    assert entries["age_ticks"][0].tolist() == [0, 3]
+    assert entries["on_time"].all()
+
+
+def test_an_estimate_out_more_than_a_period_after_its_tick_is_late(tmp_path: Path) -> None:
+    recorder = EstimateRecorder(tmp_path / "a.estimates", HEADER, 10**6)
+    for published_s in (1.19, 1.21):
+        recorder.write(ready(10), published_s, 0.0)
+    recorder.close()
+    assert read_record(recorder.path)[1]["on_time"].tolist() == [True, False]
+
+
+def test_a_killed_writer_leaves_whole_entries(tmp_path: Path) -> None:
+    path = tmp_path / "agent_001.estimates"
+    recorder = EstimateRecorder(path, HEADER, 10**6)
+    recorder.write(ready(1), 0.0, 0.0)
+    recorder.write(ready(2), 0.0, 0.0)
+    recorder.close()
+    path.write_bytes(path.read_bytes()[:-5])
+    assert read_record(path)[1]["tick"].tolist() == [1]
+
+
+def test_a_full_record_stops_growing_and_says_so(tmp_path: Path) -> None:
+    recorder = EstimateRecorder(tmp_path / "a.estimates", HEADER, 3 * entry_dtype(2).itemsize)
+    for tick in range(5):
+        recorder.write(ready(tick), 0.0, 0.0)
+    recorder.close()
+    assert (recorder.written, recorder.skipped) == (3, 2)
+
+
+def test_what_is_no_record_is_named(tmp_path: Path) -> None:
+    for content in (b"", b"not json\n", b'{"format":"other/1"}\n'):
+        path = tmp_path / "wrong.estimates"
+        path.write_bytes(content)
+        with pytest.raises(RecordError, match=r"wrong.estimates: expected"):
+            read_record(path)
+    with pytest.raises(RecordError, match="cannot be read"):
+        read_record(tmp_path / "missing")
+    (tmp_path / "file").write_text("")
+    with pytest.raises(RecordError, match="cannot be written"):
+        EstimateRecorder(tmp_path / "file" / "a.estimates", HEADER, 10**6)
+    with pytest.raises(RecordError, match="cannot be written"):
+        write_summary(tmp_path / "file" / "a.json", {})
+
+
+def test_an_estimate_travels_with_its_senders_own_block() -> None:
+    message = estimate_message(ready(5).estimate, (1, 2), slice(6, 12))
+    assert message.own_covariance == pytest.approx(ready(5).estimate.covariance[6:, 6:])
+    assert message.variance == pytest.approx(ready(5).estimate.covariance.diagonal())
+    assert (message.tick, message.status, message.age_ticks) == (5, 0, (0, 3))
+
+
+# --- start -------------------------------------------------------------------------------------------------
+
+
+def position(observer: int, tick: int, north_m: float) -> PositionRecord:
+    return PositionRecord(observer, tick, (north_m, 1.0, -5.0), (0.1, 0.1, 0.1))
+
+
+def test_the_start_waits_for_own_fixes_and_a_while_for_those_of_others(make_config: MakeConfig) -> None:
+    start = Initialiser(make_config(2), 1)
+    assert not start.ready(100, 10.0)
+    for tick in range(98, 103):
+        start.note(position(1, tick, 3.0))
+    assert not start.ready(102, 10.3)
+    assert start.ready(102, 12.1)
+    start.note(position(2, 102, 9.0))
+    assert start.ready(102, 10.4)
+    mean, covariance = start.prior(102)
+    assert mean[[0, 6]].tolist() == [3.0, 9.0]
+    assert covariance.diagonal()[[0, 3]].tolist() == [2500.0, 9.0]
+
+
+def test_without_own_fixes_the_start_is_amid_the_neighbours(make_config: MakeConfig) -> None:
+    start = Initialiser(make_config(3), 3)
+    start.ready(0, 0.0)
+    start.note(position(1, 100, 2.0))
+    start.note(position(2, 100, 6.0))
+    start.note(VelocityRecord(2, 100, (1.0, 2.0, 0.0), (0.1, 0.1, 1e6)))
+    assert not start.ready(100, 9.9)
+    assert start.ready(100, 10.0)
+    mean, covariance = start.prior(100)
+    assert mean[[0, 6, 12]].tolist() == [2.0, 6.0, 4.0]
+    assert mean[9:12].tolist() == [1.0, 2.0, 0.0]
+    assert covariance[12, 12] == 4 * covariance[0, 0]
+
+
+def test_a_moving_drone_starts_at_the_velocity_of_its_fixes(make_config: MakeConfig) -> None:
+    start = Initialiser(make_config(2), 1)
+    for k in (3, 0, 4, 1, 2):
+        fix = PositionRecord(1, 100 + k, (0.6 * k + 0.06, 1.0, -0.3 * k), (0.1,) * 3, offset_s=0.01)
+        start.note(fix)
+        start.note(position(2, 100 + k % 2, 9.0))
+    mean, _ = start.prior(104)
+    assert mean[3:6] == pytest.approx([6.0, 0.0, -3.0])
+    assert mean[9:12].tolist() == [0.0, 0.0, 0.0]  # two instants show no velocity
+
+
+def test_old_fixes_start_nothing(make_config: MakeConfig) -> None:
+    start = Initialiser(make_config(2), 1)
+    for tick in range(5):
+        start.note(position(1, tick, 3.0))
+    assert not start.ready(50, 5.0)
+
+
+def test_an_unknown_drone_is_put_at_its_measured_distance(make_config: MakeConfig) -> None:
+    start = Initialiser(make_config(2), 1)
+    for tick in range(3):
+        start.note(position(1, tick, 3.0))
+    start.note(RangeRecord(1, 2, 2, 7.0, 0.01))
+    mean, _ = start.prior(2)
+    assert np.linalg.norm(mean[6:9] - mean[0:3]) == pytest.approx(7.0)
+
+
+@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf"])
+def test_warming_up_runs_the_estimator_that_is_to_come(make_config: MakeConfig, kind: str) -> None:
+    solved = []
+
+    def factory(*arguments: Any) -> Any:
+        made = make_estimator(*arguments)
+        solve = made.solve
+        made.solve = lambda budget=None: solved.append(solve(budget))  # type: ignore[assignment,method-assign,func-returns-value]
+        return made
+
+    warm_up(make_config(3, f"estimator.kind={kind}"), 2, factory)
+    assert len(solved) == 3
+    assert {estimate.status for estimate in solved} <= {Status.OK, Status.NOT_CONVERGED}

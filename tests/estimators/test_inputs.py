@@ -1,0 +1,74 @@
+"""Known accelerations, and what stands for the unknown ones."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from estimators.inputs import HISTORY_TICKS, InputHistory
+
+OTHER = 4.0 / 3.0
+NOISE = np.full(3, 0.01)
+
+
+def history(hold: bool, accels: dict[int, float], slot: int = 1) -> InputHistory:
+    """A history of two agents; ``accels`` by tick, the same on all axes, of one of them."""
+    made = InputHistory(2, OTHER, hold=hold)
+    for tick, value in accels.items():
+        made.insert(tick, slot, np.full(3, value), NOISE)
+    return made
+
+
+def test_known_inputs_stand_at_their_ticks_and_unknown_ones_are_zero_and_wide() -> None:
+    accel, variance = history(False, {4: 0.5, 6: 0.7}).table(4, 7)
+    assert accel[:, 3:].tolist() == [[0.5] * 3, [0.0] * 3, [0.7] * 3]
+    assert variance[:, 3:].tolist() == [[0.01] * 3, [OTHER] * 3, [0.01] * 3]
+    assert (accel[:, :3] == 0).all()
+    assert (variance[:, :3] == OTHER).all()
+
+
+def test_an_unknown_input_is_held_with_a_variance_that_grows_with_its_age() -> None:
+    # GIVEN an agent whose acceleration changed by 0.1 per tick
+    held = history(True, {0: 0.0, 1: 0.1, 2: 0.2, 3: 0.3})
+    # WHEN nothing is known from tick 4 on
+    accel, variance = held.table(3, 7)
+    # THEN the last one is held, and its variance grows by the square of the ticks
+    assert accel[:, 3] == pytest.approx([0.3] * 4)
+    assert variance[:, 3] == pytest.approx([0.01, 0.02, 0.05, 0.10])
+
+
+def test_a_held_input_is_never_trusted_less_than_an_unknown_one() -> None:
+    _, variance = history(True, {tick: 0.5 * tick for tick in range(6)}).table(5, 40)
+    assert variance[1:, 3].max() == OTHER
+
+
+def test_too_few_known_changes_hold_nothing() -> None:
+    accel, variance = history(True, {0: 1.0, 1: 1.0}).table(1, 3)
+    assert accel[1, 3] == 0.0
+    assert variance[1, 3] == OTHER
+
+
+def test_an_input_is_held_forward_never_backward() -> None:
+    accel, _ = history(True, dict.fromkeys(range(10, 15), 1.0)).table(8, 12)
+    assert accel[:, 3].tolist() == [0.0, 0.0, 1.0, 1.0]
+
+
+def test_the_order_of_arrival_does_not_matter() -> None:
+    rng = np.random.default_rng(1)
+    samples = {tick: float(rng.normal()) for tick in range(20) if tick % 7}
+    backwards = dict(reversed(samples.items()))
+    for one, other in zip(history(True, samples).table(10, 25), history(True, backwards).table(10, 25), strict=True):
+        assert (one == other).all()
+
+
+def test_the_first_of_two_inputs_for_one_tick_counts() -> None:
+    made = history(False, {3: 1.0})
+    made.insert(3, 1, np.full(3, 9.0), NOISE)
+    assert made.table(3, 4)[0][0, 3] == 1.0
+
+
+def test_memory_is_bounded() -> None:
+    made = history(True, dict.fromkeys(range(500), 1.0))
+    made.forget_before(500)
+    assert made.table(490 - HISTORY_TICKS, 491 - HISTORY_TICKS)[0][0, 3] == 0.0  # gone
+    assert made.table(499, 500)[0][0, 3] == 1.0

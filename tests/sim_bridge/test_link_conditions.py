@@ -1,0 +1,65 @@
+"""Link conditions of the studies."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from sim_bridge.link_conditions import (
+    with_bursts,
+    with_delay,
+    with_fu_channel,
+    with_loss,
+    with_one_way,
+    with_partition,
+)
+from sim_bridge.study_scenario import Scenario
+
+RECORDING = Scenario("K5", samples=2000).record(0, 0)
+SIGMA = 4.0 / np.sqrt(RECORDING.received.size)
+"""Four standard deviations of a share of all packets, at most."""
+
+
+def test_bernoulli_loss_has_its_probability_and_repeats_by_seed() -> None:
+    one = with_loss(RECORDING, 0.3, np.random.default_rng(1))
+    assert one.received.mean() == pytest.approx(0.7, abs=SIGMA)
+    assert (one.received == with_loss(RECORDING, 0.3, np.random.default_rng(1)).received).all()
+    assert RECORDING.received.all()
+
+
+def test_bursts_have_their_share_and_their_length() -> None:
+    lost = ~with_bursts(RECORDING, 0.2, 5.0, np.random.default_rng(2)).received
+    assert lost.mean() == pytest.approx(0.2, abs=10 * SIGMA)  # neighbouring ticks are not independent
+    begins = lost[1:] & ~lost[:-1]
+    assert lost[1:].sum() / begins.sum() == pytest.approx(5.0, rel=0.1)
+
+
+def test_delays() -> None:
+    assert (with_delay(RECORDING, 2).delay_ticks == 2).all()
+    spread = with_delay(RECORDING, 1, 3, np.random.default_rng(3)).delay_ticks
+    assert set(np.unique(spread)) == {1, 2, 3, 4}
+
+
+def test_the_fu_channel() -> None:
+    fu = with_fu_channel(RECORDING, np.random.default_rng(4))
+    on_time = fu.received & (fu.delay_ticks == 0)
+    late = fu.received & (fu.delay_ticks == 1)
+    assert on_time.mean() == pytest.approx(0.4, abs=SIGMA)
+    assert late.mean() == pytest.approx(0.3, abs=SIGMA)
+    assert (on_time | late | ~fu.received).all()
+
+
+def test_a_partition_cuts_both_ways_and_heals() -> None:
+    cut = with_partition(RECORDING, (0, 1), 10, 20).received
+    assert not cut[10:20, 0, 2].any()
+    assert not cut[10:20, 2, 0].any()
+    assert cut[10:20, 0, 1].all()
+    assert cut[10:20, 2, 4].all()
+    assert cut[:10].all()
+    assert cut[20:].all()
+
+
+def test_a_one_way_link() -> None:
+    one_way = with_one_way(RECORDING, 0, 1).received
+    assert not one_way[:, 0, 1].any()
+    assert one_way[:, 1, 0].all()

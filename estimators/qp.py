@@ -12,20 +12,18 @@ exact by `polish`, which finds the active set next to it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, Protocol
+from typing import Literal, Protocol
 
 import numpy as np
 
+from estimators.active_set import FEASIBILITY, settle
 from estimators.measurements import Matrix, Vector
-
-FEASIBILITY = 1e-9
-"""How far a row may be outside, and a multiplier beyond its limits, in a polished solution (relative)."""
 
 ENGINE_ACCURACY = 1e-5
 """How near its bound an engine leaves a row that is held there; an order above the tolerances it is run with."""
 
 POLISH_ROUNDS = 30
-GUESS_ROUNDS = 4
+GUESS_ROUNDS = 8
 
 _NONE = 1e30
 """What DAQP takes for infinity."""
@@ -86,76 +84,11 @@ def polish(
     Rows are free, held at a bound (multiplier to be found) or saturated (outside at the price of the
     penalty). None where the set does not settle.
     """
-    rows, penalty = problem.rows, problem.penalty
-    slack = _margin(problem)
-    rough = slack if q is None else slack * (ENGINE_ACCURACY / FEASIBILITY)
-    q = -problem.linear - rows.T @ multipliers if q is None else q
-    held, saturated, side = _sort_rows(problem, rows @ q, multipliers, rough)
-    for _ in range(rounds):
-        fixed = np.where(saturated, side * np.where(np.isfinite(penalty), penalty, 0.0), 0.0)
-        base = -problem.linear - rows.T @ fixed
-        active = rows[held]
-        bound = np.where(side > 0, problem.upper, problem.lower)[held]
-        force = _solve_symmetric(active @ active.T, active @ base - bound)
-        q = base - active.T @ force
-        found = fixed.copy()
-        found[held] = force
-        values = rows @ q
-        if _is_optimal(problem, values, found, held, saturated, side, slack):
-            return QpSolution(q, found, True)
-        held, saturated, side = _sort_rows(problem, values, found, slack)
-    return None
-
-
-def _solve_symmetric(a: Matrix, b: Vector) -> Vector:
-    """a^-1 b; the shortest solution where held rows depend on each other."""
-    if not len(b):
-        return b
-    try:
-        x = np.linalg.solve(a, b)
-        if np.isfinite(x).all() and np.abs(a @ x - b).max() <= 1e-9 * (1.0 + np.abs(b).max()):
-            return np.asarray(x, np.float64)
-    except np.linalg.LinAlgError:
-        pass  # exactly singular: as below
-    return np.asarray(np.linalg.lstsq(a, b, rcond=None)[0], np.float64)
-
-
-def _margin(problem: QuadraticProgram) -> Vector:
-    width = np.where(np.isfinite(problem.upper - problem.lower), problem.upper - problem.lower, 1.0)
-    return np.asarray(FEASIBILITY * np.maximum(1.0, width))
-
-
-def _sort_rows(
-    problem: QuadraticProgram, values: Vector, multipliers: Vector, slack: Vector
-) -> tuple[Any, Any, Any]:
-    """Masks of held and saturated rows, and the side (+1 upper, -1 lower) of every row."""
-    over, under = values - problem.upper, problem.lower - values
-    side = np.where(multipliers != 0.0, np.sign(multipliers), np.where(over >= under, 1.0, -1.0))
-    outside = np.where(side > 0, over, under)
-    strength = side * multipliers
-    saturated = (strength >= problem.penalty * (1.0 - 1e-7)) & (outside > -slack)
-    held = ~saturated & ((outside > slack) | ((strength > 0.0) & (outside > -slack)))
-    # a multiplier found on its bound keeps the row; one that pulls inwards frees it
-    held &= strength >= 0.0
-    return held, saturated, side
-
-
-def _is_optimal(
-    problem: QuadraticProgram,
-    values: Vector,
-    multipliers: Vector,
-    held: Any,
-    saturated: Any,
-    side: Any,
-    slack: Vector,
-) -> bool:
-    over = np.maximum(values - problem.upper, problem.lower - values)
-    outside = np.where(side > 0, values - problem.upper, problem.lower - values)
-    strength = side * multipliers
-    feasible = (over <= slack) | saturated
-    signed = ~held | ((strength >= 0.0) & (strength <= problem.penalty * (1.0 + FEASIBILITY)))
-    beyond = ~saturated | (outside >= -slack)
-    return bool((feasible & signed & beyond).all())
+    accuracy = FEASIBILITY if q is None else ENGINE_ACCURACY
+    found = multipliers.copy()
+    exact = -problem.linear - problem.rows.T @ multipliers if q is None else q.copy()
+    arrays = (problem.linear, np.ascontiguousarray(problem.rows), problem.lower, problem.upper, problem.penalty)
+    return QpSolution(exact, found, True) if settle(*arrays, accuracy, rounds, exact, found) else None
 
 
 class OsqpEngine:
@@ -209,7 +142,7 @@ class DaqpEngine:
     identity); `polish` removes what that leaves.
     """
 
-    SLACK_CURVATURE = 1e-2
+    SLACK_CURVATURE = 1e-4
 
     def solve(self, problem: QuadraticProgram) -> QpSolution:
         """Solve exactly, up to the slacks' curvature."""

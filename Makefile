@@ -1,5 +1,5 @@
 # make test   everything that must hold: lint, types, rooms, tests
-# make demo   a quick study; says where its result is
+# make demo   a minute of a live fleet of three drones; says where its report is
 # make lock   resolve the dependencies anew and write requirements.lock
 # make lowest run the tests with the lowest version of each dependency that pyproject.toml admits
 
@@ -9,7 +9,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP_OPTIONS := --disable-pip-version-check --progress-bar off --quiet
 IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "fleetloc needs Python 3.11 or newer, found " + sys.version.split()[0] + "; choose one with: make PYTHON=python3.12")
-DEMO_RESULT := out/demo/table1.json
+DEMO_FOLDER := out/demo
+DEMO_SECONDS := 60
 
 .PHONY: test demo lock lowest clean
 
@@ -20,9 +21,8 @@ test: $(INSTALLED)
 	$(BIN)/pytest -n 2
 
 demo: $(INSTALLED)
-	mkdir -p $(dir $(DEMO_RESULT))
-	$(BIN)/fleetloc bench table1 --runs 4 --json $(DEMO_RESULT)
-	@echo "result: $(DEMO_RESULT)"
+	$(BIN)/fleetloc fleet configs/line3.toml --duration $(DEMO_SECONDS) --out $(DEMO_FOLDER)
+	@echo "open $(DEMO_FOLDER)/report.html in a browser; the figures are in $(DEMO_FOLDER)/report.json"
 
 # The stamp is newer than the lock and the project file exactly when both are installed.
 $(INSTALLED): requirements.lock pyproject.toml

@@ -24,6 +24,8 @@ MAX_STAMP_LEAD_S = 0.2
 UNIX_US = 10**15
 """A ``time_usec`` above this is Unix time (after 2001), below it time since boot."""
 _ACCEL_AND_GYRO = 0b111111
+MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
+"""Per axis; beyond what any IMU of a drone can measure (100 g, 5700 deg/s), so no measurement."""
 
 StampS = Callable[[float, float], float | None]
 """(boot time, arrival) to fleet time in s; ``None`` if it cannot be told."""
@@ -90,6 +92,8 @@ class SampleAdapter:
     def _imu(self, time_usec: int, force: Triple, turn: Triple, arrival_s: float) -> Sample | None:
         if not _finite(*force, *turn):
             return self._skip("imu: not finite")
+        if max(map(abs, force)) > MAX_FORCE_MPS2 or max(map(abs, turn)) > MAX_TURN_RADPS:
+            return self._skip("imu: out of range")
         t_s = self._stamp(time_usec, arrival_s, "imu")
         return None if t_s is None else ImuSample(t_s - self._sensors.imu_latency_s, force, turn)
 

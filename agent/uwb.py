@@ -7,7 +7,7 @@ from collections.abc import Collection
 
 from agent.config_tables import SensorsTable
 from agent.samples import RangeSample
-from transport.uwb_body import UwbIntake, UwbRange
+from transport.uwb_body import UwbFrame, UwbIntake, UwbRange
 
 NLOS_REJECT_DB = 10.0
 NLOS_SUSPECT_DB = 6.0
@@ -40,7 +40,10 @@ class UwbAdapter:
         accepted = self.intake.accept(payload, unix_s=unix_s, monotonic_s=host_s)
         if accepted is None:
             return []
-        frame, age_s = accepted
+        return self.samples_of(*accepted, now_s)
+
+    def samples_of(self, frame: UwbFrame, age_s: float, now_s: float) -> list[RangeSample]:
+        """The samples in a frame that was accepted ``age_s`` after its measurement, at fleet time ``now_s``."""
         measured_s = now_s - max(age_s, 0.0) - self._sensors.uwb_latency_s
         samples = (self._sample(entry, measured_s, now_s) for entry in frame.ranges)
         return [sample for sample in samples if sample is not None]

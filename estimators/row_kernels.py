@@ -13,9 +13,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.compiled import kernel
+from estimators.compiled import entry, kernel
 from estimators.layout import STATES_PER_AGENT
-from estimators.measurements import Kind, Matrix, RowTable, Vector
+from estimators.measurements import ROW, Kind, Matrix, RowTable, Vector
 
 IntArray = NDArray[np.int64]
 
@@ -26,6 +26,24 @@ RANGE = int(Kind.RANGE)
 ANCHOR_RANGE = int(Kind.ANCHOR_RANGE)
 
 OFFSET, VALUE, PRECISION, HALF_WIDTH, X, Y, Z = range(7)
+
+
+@entry("void(ROW[::1], int64, boolean[::1])", ROW=ROW)
+def mark_usable(rows: RowTable, agents: int, usable: NDArray[np.bool_]) -> None:
+    """usable ``(m,)`` <- whether an estimator of so many agents can use each row.
+
+    Finite, with a positive variance and bound, of a known kind, of agents in the fleet; a range between two of
+    them.
+    """
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        kind = row["kind"]
+        other = row["other"]
+        finite = np.isfinite(row["offset_s"]) and np.isfinite(row["value"]) and np.isfinite(row["variance"])
+        finite = finite and np.isfinite(row["x"]) and np.isfinite(row["y"]) and np.isfinite(row["z"])
+        known = 0 <= row["agent"] < agents and 0 <= row["observer"] < agents and 0 <= kind <= ANCHOR_RANGE
+        paired = (0 <= other < agents and other != row["agent"]) if kind == RANGE else other == -1
+        usable[r] = finite and row["variance"] > 0.0 and row["half_width"] > 0.0 and known and paired
 
 
 @kernel

@@ -17,7 +17,7 @@ from estimators.measurements import (
     RowTable,
     empty_rows,
 )
-from estimators.row_kernels import IntArray
+from estimators.row_kernels import IntArray, mark_usable
 
 _SORT_KEYS = ("z", "y", "x", "offset_s", "other", "agent", "kind", "observer", "tick")
 """Least significant first, as `numpy.lexsort` takes them. Together they identify a record."""
@@ -71,8 +71,9 @@ class MeasurementWindow:
         self._insert_inputs(inputs)
         if not len(rows):
             return
-        rows = np.asarray(rows, ROW)
-        usable = self._usable(rows)
+        rows = np.ascontiguousarray(rows, ROW)
+        usable = np.empty(len(rows), np.bool_)
+        mark_usable(rows, self.layout.size, usable)
         timely = rows["tick"] >= self.first
         self.refused += int(np.count_nonzero(~usable))
         self.dropped += int(np.count_nonzero(usable & ~timely))
@@ -80,24 +81,10 @@ class MeasurementWindow:
         if not len(kept):
             return
         np.maximum.at(self._last_heard, kept["observer"], kept["tick"])
-        merged = np.concatenate([self._rows, kept])
+        merged = np.empty(len(self._rows) + len(kept), ROW)  # numpy's concatenation promotes every field, slowly
+        merged[: len(self._rows)], merged[len(self._rows) :] = self._rows, kept
         merged = merged[np.lexsort([merged[key] for key in _SORT_KEYS])]
         self._rows = merged[_first_of_each(merged)]
-
-    def _usable(self, rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-        n = self.layout.size
-        ok = np.isfinite(rows["offset_s"]) & np.isfinite(rows["value"]) & np.isfinite(rows["variance"])
-        ok &= (rows["variance"] > 0) & (rows["half_width"] > 0)
-        ok &= np.isfinite(rows["x"]) & np.isfinite(rows["y"]) & np.isfinite(rows["z"])
-        ok &= (rows["agent"] >= 0) & (rows["agent"] < n) & (rows["observer"] >= 0) & (rows["observer"] < n)
-        between = rows["kind"] == Kind.RANGE
-        ok &= np.where(
-            between,
-            (rows["other"] >= 0) & (rows["other"] < n) & (rows["other"] != rows["agent"]),
-            rows["other"] == -1,
-        )
-        ok &= (rows["kind"] >= 0) & (rows["kind"] <= max(Kind))
-        return np.asarray(ok)
 
     def _insert_inputs(self, inputs: InputTable) -> None:
         for sample in np.asarray(inputs, INPUT):

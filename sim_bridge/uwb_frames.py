@@ -7,13 +7,17 @@ from transport.uwb_body import MAX_RANGE_M, UwbFrame, UwbRange, encode_uwb_json
 
 
 class UwbDrivers:
-    """Makes the payloads of all observers' frames; their times are on the clock of ``now``."""
+    """Makes all observers' frames; their times are on the clock of ``now``."""
 
     def __init__(self) -> None:
         self._sequence: dict[int, int] = {}
 
     def payload(self, taken_s: float, ranges: RangeSet) -> bytes:
-        """One frame, stamped ``taken_s`` as CLOCK_MONOTONIC of this host."""
+        """One frame as it travels, stamped ``taken_s`` as CLOCK_MONOTONIC of this host."""
+        return encode_uwb_json(self.frame(taken_s, ranges))
+
+    def frame(self, taken_s: float, ranges: RangeSet) -> UwbFrame:
+        """The same as a value."""
         sequence = self._sequence.get(ranges.observer, 0)
         self._sequence[ranges.observer] = sequence + 1
         entries = tuple(
@@ -28,4 +32,4 @@ class UwbDrivers:
             for measured in ranges.ranges
             if measured.range_m <= MAX_RANGE_M
         )
-        return encode_uwb_json(UwbFrame(sequence, "mono", round(1e9 * taken_s), entries, ranges.observer))
+        return UwbFrame(sequence, "mono", round(1e9 * taken_s), entries, ranges.observer)

@@ -133,7 +133,7 @@ class FleetWorld:
         """Attitudes before and after the last step, ``(2, n, 4)``, computed when somebody looks."""
         both = np.concatenate((self._accel_before_mps2, self.accel_mps2))
         force = both - np.array((0.0, 0.0, self.dynamics.gravity_mps2))
-        return quaternions.from_thrust(force, np.tile(self.yaw_rad, 2)).reshape(2, -1, 4)
+        return quaternions.from_thrust(force, np.concatenate((self.yaw_rad, self.yaw_rad))).reshape(2, -1, 4)
 
     def _update_attitudes(self) -> None:
         if self._attitudes_step != self.step_index:

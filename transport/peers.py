@@ -94,6 +94,8 @@ class Peer:
             self._numbers.clear()
         self.received += 1
         self.last_received_s = now
+        if header.kind is Kind.CLOCK:
+            return  # answers go to whoever asked: the numbers between are other neighbours', not lost
         numbers = self._numbers.setdefault(header.kind, _Numbers(header.seq, header.seq, 0))
         numbers.received += 1
         numbers.first = min(numbers.first, header.seq)

@@ -19,7 +19,8 @@ import pytest
 ROOT = Path(__file__).parents[2]
 LINE3 = ROOT / "configs" / "line3.toml"
 HOST = "127.0.0.1"
-PATIENCE_S = 120.0
+PATIENCE_S = 300.0
+"""A first start compiles kernels."""
 POLL_S = 0.05
 
 

@@ -1,0 +1,114 @@
+"""``fleetloc fleet``: a whole fleet on this machine, live or in virtual time, and its report."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetloc.errors import INTERRUPTED
+
+if TYPE_CHECKING:
+    from agent.config_tables import FleetConfig
+    from fleetloc.fleet_run import Outcome
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("fleet")(fleet)
+
+
+def fleet(
+    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the world and of injected faults.")] = None,
+    loss: Annotated[float | None, typer.Option("--loss", help="Probability that a packet is lost, 0..1.")] = None,
+    delay_s: Annotated[float | None, typer.Option("--delay", help="Delay of every packet in s.")] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
+    ] = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Virtual time in one process: fast, and the same at every run.")
+    ] = False,
+) -> None:
+    """Fly a simulated fleet with one daemon per drone, show it live, and write a report.
+
+    Ends after the duration or on Ctrl-C; the report is written in either case.
+    """
+    from fleetloc import run_files
+    from fleetloc.fleet_report import write_report
+    from fleetloc.warmup import announce, warm_up_everything
+
+    options: dict[str, float | int | None] = {
+        "sim.duration_s": duration_s,
+        "sim.seed": seed,
+        "transport.seed": seed,
+        "transport.loss": loss,
+        "transport.delay_s": delay_s,
+    }
+    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
+    fleet_config = _prepared(config, [*settings, *(overrides or ())], out, signed_keys=not lockstep)
+    folder = Path(str(fleet_config.record.directory))
+    announce()
+    warm_up_everything()
+    if lockstep:
+        from fleetloc.lockstep_run import fly_in_lockstep
+
+        began_s = time.monotonic()
+        outcome = fly_in_lockstep(fleet_config, folder)
+        outcome.wall_s = time.monotonic() - began_s
+    else:
+        outcome = _fly(fleet_config, folder)
+        if outcome.wall_s == 0.0:  # interrupted before anything flew
+            raise typer.Exit(INTERRUPTED)
+    write_report(fleet_config, folder, outcome, json_file, "lockstep" if lockstep else "live")
+    typer.echo(f"report: {folder / run_files.REPORT_HTML}")
+
+
+def _prepared(config: Path, settings: list[str], out: Path | None, *, signed_keys: bool) -> FleetConfig:
+    """The effective configuration, also written into the run's folder for all its processes.
+
+    Checks before anything starts: the scenario, the keys.
+    """
+    import msgspec
+
+    from agent.config import dump, load_config
+    from fleetloc import run_files
+    from sim_bridge.scenario_config import scenario_from_config
+    from transport.keys import load_secret, load_trust
+
+    fleet = load_config(config, settings)
+    scenario_from_config(fleet)
+    # absolute, so that a daemon can be restarted from anywhere with the configuration in the folder
+    folder = (out or Path("out") / fleet.fleet.name).resolve()
+    keys = (config.parent / fleet.security.keys).resolve()
+    if signed_keys and fleet.security.mode == "signed":
+        load_trust(keys, fleet.ids)
+        for agent_id in fleet.ids:
+            load_secret(keys, agent_id)
+    replace = msgspec.structs.replace
+    fleet = replace(
+        fleet,
+        record=replace(fleet.record, directory=str(folder)),
+        security=replace(fleet.security, keys=str(keys)),
+    )
+    run_files.clear(folder)
+    (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
+    return fleet
+
+
+def _fly(config: FleetConfig, folder: Path) -> Outcome:
+    import asyncio
+
+    from rich.console import Console
+
+    from fleetloc.fleet_run import FleetRun
+
+    async def fly() -> Outcome:
+        return await FleetRun(config, folder, Console(stderr=True)).fly()
+
+    return asyncio.run(fly())

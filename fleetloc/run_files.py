@@ -1,0 +1,76 @@
+"""The files of a run in its folder: who writes which, and how several records of one agent are told apart.
+
+===========================  ==================================================================
+``fleet.toml``               the effective configuration; every process of the run reads this one
+``truth.npz``                where every drone truly was (`sim_bridge.truth`)
+``agent_001.estimates``      the last record of agent 1 (`agent.recording`)
+``agent_001.1.estimates``    the record before it, if the daemon was restarted; ``.2`` the next, ...
+``agent_001.json``           counters of its last daemon, likewise
+``agent_001.log``            what the daemon said on stderr
+``simulator.log``            what the simulator said
+``simulator.json``           how its run went (`sim_bridge.simulator.SimulatorReport`)
+``report.json``              figures
+``report.html``              the same for people, with plots
+===========================  ==================================================================
+"""
+
+from __future__ import annotations
+
+import itertools
+import re
+from pathlib import Path
+
+from agent.recording import SUFFIX
+
+CONFIG, TRUTH, REPORT_JSON, REPORT_HTML = "fleet.toml", "truth.npz", "report.json", "report.html"
+SIMULATOR_LOG, SIMULATOR_JSON = "simulator.log", "simulator.json"
+SUMMARY_SUFFIX = ".json"
+_OF_A_RUN = re.compile(r"agent_[0-9]{3}(\.[0-9]+)?\.(estimates|json|log)")
+
+
+def record_path(directory: Path, agent_id: int) -> Path:
+    """The record that a daemon writes."""
+    return directory / f"agent_{agent_id:03d}{SUFFIX}"
+
+
+def log_path(directory: Path, agent_id: int) -> Path:
+    """What a daemon says on stderr."""
+    return directory / f"agent_{agent_id:03d}.log"
+
+
+def keep_earlier_record(directory: Path, agent_id: int) -> None:
+    """Rename what an earlier daemon of this agent left, so that a restart does not overwrite it.
+
+    Raises `OSError` if the folder refuses.
+    """
+    record = record_path(directory, agent_id)
+    if not record.exists():
+        return
+    number = next(n for n in itertools.count(1) if not _numbered(record, n).exists())
+    record.rename(_numbered(record, number))
+    summary = record.with_suffix(SUMMARY_SUFFIX)
+    if summary.exists():
+        summary.rename(_numbered(summary, number))
+
+
+def records(directory: Path, agent_id: int) -> list[Path]:
+    """All records of an agent, the earliest first."""
+    last = record_path(directory, agent_id)
+    earlier = itertools.takewhile(Path.exists, (_numbered(last, n) for n in itertools.count(1)))
+    return [*earlier, *([last] if last.exists() else [])]
+
+
+def clear(directory: Path) -> None:
+    """Make the folder, and remove what an earlier run left in it; nothing else is touched.
+
+    Raises `OSError` if the folder refuses.
+    """
+    directory.mkdir(parents=True, exist_ok=True)
+    named = {CONFIG, TRUTH, REPORT_JSON, REPORT_HTML, SIMULATOR_LOG, SIMULATOR_JSON}
+    for path in directory.iterdir():
+        if path.name in named or _OF_A_RUN.fullmatch(path.name):
+            path.unlink()
+
+
+def _numbered(path: Path, number: int) -> Path:
+    return path.with_name(f"{path.stem}.{number}{path.suffix}")

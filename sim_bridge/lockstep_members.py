@@ -1,0 +1,177 @@
+"""One agent of a fleet in virtual time: its core with everything that the daemon puts around it, but sockets."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+from agent.autopilot import AutopilotSession, LinkState
+from agent.config_tables import FleetConfig
+from agent.core import AgentCore, EstimatorFactory
+from agent.frames import FleetFrame
+from agent.mavlink_samples import SampleAdapter
+from agent.samples import AttitudeSample, GpsSample, ImuSample, Sample
+from agent.uwb import UwbAdapter
+from transport.auth import UNSIGNED
+from transport.channel import Channel, ChannelSettings
+from transport.header import Kind
+from transport.information_body import Information
+from transport.opening import Opener, Received
+from transport.sealing import Message, Sealer
+from transport.streams import key_expression
+from transport.uwb_body import UwbFrame
+
+BOOT = 1
+"""Start number of every agent; nothing that is recorded depends on it."""
+
+Parcel = Any
+"""What a member packs and another unpacks: a key with bytes, or a `Received`."""
+
+
+class Member(ABC):
+    """What both fidelities share; ``channel`` holds the configured loss and delay on the way in."""
+
+    def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory) -> None:
+        self.agent_id = agent_id
+        self.core = AgentCore(config, agent_id, make_estimator)
+        self.uwb = UwbAdapter(agent_id, config.ids, config.sensors)
+        transport = config.transport
+        faults = ChannelSettings(
+            loss=transport.loss, delay_s=transport.delay_s, delay_exponential_s=transport.delay_jitter_s
+        )
+        self.channel: Channel[Parcel] = Channel.seeded(
+            faults, seed=transport.seed, receiver=agent_id, neighbours=config.neighbours(agent_id)
+        )
+
+    @abstractmethod
+    def pack(self, message: Message, unix_ns: int) -> list[Parcel]:
+        """What goes on the air for a message."""
+
+    @abstractmethod
+    def unpack(self, parcel: Parcel, now_s: float, unix_ns: int) -> Received | None:
+        """The message in what came; ``None`` if there is none (yet)."""
+
+    @abstractmethod
+    def counters(self) -> dict[str, int]:
+        """Those counters of a daemon that have a meaning here."""
+
+    def on_sample(self, sample: Sample, now_s: float) -> None:
+        """A sample of the autopilot's sensors; ``now_s`` fleet time."""
+        if isinstance(sample, ImuSample):
+            self.core.on_imu(sample, now_s)
+        elif isinstance(sample, AttitudeSample):
+            self.core.on_attitude(sample, now_s)
+        elif isinstance(sample, GpsSample):
+            self.core.on_gps(sample, now_s)
+
+    def _common_counters(self, samples: SampleAdapter) -> dict[str, int]:
+        counters = {"injected losses": sum(self.channel.lost.values()), **self.core.counters}
+        for prefix, table in (
+            ("skipped ", samples.skipped),
+            ("skipped ", self.core.timeline.skipped),
+            ("skipped uwb ", self.uwb.skipped),
+            ("refused ", self.core.records.refused),
+            ("rejected uwb ", self.uwb.intake.rejections.as_dict()),
+        ):
+            counters |= {f"{prefix}{name}": count for name, count in table.items()}
+        return counters
+
+
+class ValueMember(Member):
+    """Takes samples, fixes and packets as objects; ``start_fleet_s`` is the fleet time of stamp zero."""
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, start_fleet_s: float
+    ) -> None:
+        super().__init__(config, agent_id, make_estimator)
+        self.core.autopilot_state = str(LinkState.CONNECTED)
+        self._samples = SampleAdapter(
+            FleetFrame.of(config),
+            config.sensors,
+            config.fleet.epoch_unix_s,
+            lambda boot_s, _arrival_s: start_fleet_s + boot_s,
+        )
+        self._sent = 0
+        self._received = 0
+
+    def on_fix(self, message: Any, now_s: float) -> None:
+        """A GPS_RAW_INT message; ``now_s`` fleet time."""
+        sample = self._samples.convert(message, now_s)
+        if sample is not None:
+            self.on_sample(sample, now_s)
+
+    def on_uwb(self, frame: UwbFrame, age_s: float, now_s: float) -> None:
+        """A frame of the own UWB module; ``now_s`` fleet time."""
+        for sample in self.uwb.samples_of(frame, age_s, now_s):
+            self.core.on_range(sample, now_s)
+
+    def pack(self, message: Message, unix_ns: int) -> list[Parcel]:
+        self._sent += 1
+        kind = Kind.INFO if isinstance(message, Information) else Kind.MEAS
+        return [Received(self.agent_id, kind, self._sent, unix_ns, 0.0, message)]
+
+    def unpack(self, parcel: Parcel, now_s: float, unix_ns: int) -> Received | None:
+        self._received += 1
+        received: Received = parcel
+        return received
+
+    def counters(self) -> dict[str, int]:
+        counted = {"packets sent": self._sent, "packets received": self._received}
+        return counted | self._common_counters(self._samples)
+
+
+class ByteMember(Member):
+    """Speaks MAVLink with its fake autopilot and seals and opens packets as the daemon does."""
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, fleet_offset_s: float
+    ) -> None:
+        super().__init__(config, agent_id, make_estimator)
+        self._fleet = config.fleet.name
+        self._fleet_offset_s = fleet_offset_s
+        self._session = AutopilotSession(config, agent_id, datagrams=True)
+        self._session.fleet_offset_s = fleet_offset_s
+        self._sealer = Sealer(self._fleet, agent_id, boot=BOOT, signing=UNSIGNED)
+        freshness_s = config.security.freshness_s
+        self._opener = Opener(self._fleet, config.ids, UNSIGNED, own_id=agent_id, freshness_s=freshness_s)
+        self._double = {"auto": None, "float32": False, "float64": True}[config.transport.information_format]
+
+    def on_mavlink(self, data: bytes, host_s: float) -> None:
+        """A datagram of the autopilot."""
+        for sample in self._session.receive(data, host_s):
+            self.on_sample(sample, host_s + self._fleet_offset_s)
+
+    def to_autopilot(self, host_s: float) -> list[bytes]:
+        """Frames due on the autopilot's link."""
+        frames = self._session.to_send(host_s)
+        self.core.autopilot_state = str(self._session.state)
+        return frames
+
+    def on_uwb(self, payload: bytes, now_s: float, host_s: float, unix_s: float) -> None:
+        """A frame of the own UWB module; ``now_s`` fleet time."""
+        for sample in self.uwb.receive(payload, now_s=now_s, host_s=host_s, unix_s=unix_s):
+            self.core.on_range(sample, now_s)
+
+    def pack(self, message: Message, unix_ns: int) -> list[Parcel]:
+        packets = self._sealer.seal(message, t_ns=unix_ns, double=self._double)
+        return [(key_expression(self._fleet, self.agent_id, packet.stream), packet.data) for packet in packets]
+
+    def unpack(self, parcel: Parcel, now_s: float, unix_ns: int) -> Received | None:
+        key, data = parcel
+        return self._opener.open(key, data, now=now_s, unix_ns=unix_ns)
+
+    def expire(self, now_s: float) -> None:
+        """Give up what is incomplete for too long."""
+        self._opener.expire(now_s)
+
+    def counters(self) -> dict[str, int]:
+        peers = [peer for _, peer in self._opener.peers.items()]
+        counted = {
+            "mavlink rx": self._session.decoder.received,
+            "mavlink bad": self._session.decoder.bad.total(),
+            "packets sent": self._sealer.sent,
+            "packets received": sum(peer.received for peer in peers),
+            "packets lost": sum(peer.lost for peer in peers),
+        }
+        rejected = {f"rejected {name}": count for name, count in self._opener.peers.rejections().items()}
+        return counted | self._common_counters(self._session.samples) | rejected

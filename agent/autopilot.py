@@ -72,6 +72,8 @@ class AutopilotSession:
         """Fleet time minus host time; kept by the owner."""
         self.system_status: int | None = mavlink.MAV_STATE_STANDBY
         """What our heartbeat says; ``None`` = a fault: send none."""
+        self.heard = 0
+        """Messages of the autopilot's system, whatever its component."""
         self.reboots = 0
         self.ignored: Counter[str] = Counter()
         self._last_heartbeat_s = 0.0
@@ -89,6 +91,7 @@ class AutopilotSession:
         """Take in bytes of the link; the samples they hold. Answers are fetched by `to_send`."""
         samples = []
         for message in self.decoder.feed(data):
+            self.heard += message.get_srcSystem() == self._expected_system
             sample = self._on_message(message, now_s)
             if sample is not None:
                 samples.append(sample)

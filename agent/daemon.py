@@ -180,12 +180,13 @@ class Daemon:
     # --- MAVLink -------------------------------------------------------------------------------------------
 
     def _on_mavlink(self, data: bytes) -> bool:
+        """Whether the autopilot's system sent it: a stranger's frames must not draw our answers away from it."""
         host_s = time.monotonic()
         self._autopilot.fleet_offset_s = self._clock.offset_s
-        before = self._autopilot.decoder.received
+        before = self._autopilot.heard
         for sample in self._autopilot.receive(data, host_s):
             self._on_sample(sample, self._clock.fleet_s(host_s))
-        return self._autopilot.decoder.received > before
+        return self._autopilot.heard > before
 
     def _on_sample(self, sample: Sample, now_s: float) -> None:
         if isinstance(sample, ImuSample):

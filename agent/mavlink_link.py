@@ -1,7 +1,7 @@
 """The byte link to the autopilot on asyncio: UDP, TCP, serial; reopened by itself.
 
-Nothing is parsed here. Received bytes go to a callback that says whether they held a valid frame: a UDP
-link that listens answers whoever sent the last one that did.
+Nothing is parsed here. Received bytes go to a callback that says whether they held a frame of the autopilot:
+a UDP link that listens answers whoever sent the last one that did.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ READ_BYTES = 4096
 MAX_WRITE_BUFFER_BYTES = 64 * 1024
 
 OnData = Callable[[bytes], bool]
-"""Takes received bytes, tells whether a valid frame was in them."""
+"""Takes received bytes, tells whether a frame of the autopilot was in them."""
 
 
 class MavlinkLink(ABC):

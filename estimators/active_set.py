@@ -56,7 +56,7 @@ def _sort_rows(
         outside = over if side[i] > 0.0 else under
         strength = side[i] * multipliers[i]
         place[i] = FREE
-        if strength >= penalty[i] * (1.0 - SATURATED_WITHIN) and outside > -slack:
+        if strength >= penalty[i] * (1.0 - max(SATURATED_WITHIN, tolerance)) and outside > -slack:
             place[i] = SATURATED
         elif strength >= 0.0 and (outside > slack or (strength > 0.0 and outside > -slack)):
             place[i] = HELD

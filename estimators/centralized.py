@@ -71,7 +71,6 @@ class CentralizedEkf:
         self._period_s = period_s
         self._transition = transition_matrix(layout.size, period_s)
         self._inputs = input_matrix(layout.size, period_s)
-        self._tick: int | None = None
         self._had_rows = False
 
     @property
@@ -81,16 +80,8 @@ class CentralizedEkf:
 
     def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
         """Predict to the tick and update with its rows."""
-        if self._tick is not None and tick != self._tick + 1:
-            raise ValueError(f"tick {tick} after {self._tick}: ticks grow by one")
-        first = self._tick is None
-        self._tick = tick
-        if first:
-            self.window.first = tick
-        self.window.advance(tick)
-        late = measurements["tick"] < tick
-        self.window.dropped += int(np.count_nonzero(late))
-        self.window.insert(measurements[~late], inputs)
+        first = self.window.open(tick)
+        self.window.insert_current(measurements, inputs)
         if not first:
             accel, variance = self.window.inputs()
             self._mean = predict_mean(self._mean, accel[-1], self._period_s)

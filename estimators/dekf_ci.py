@@ -128,7 +128,6 @@ class DistributedEkf:
         self._healthy = True
         self._motion: tuple[Vector, Vector] | None = None
         """Acceleration and its variance over the tick that ends now; None at the first."""
-        self._tick: int | None = None
         self._rows = empty_rows()
         self._rank = 0
         self._ranks: dict[int, int] = {}
@@ -143,16 +142,8 @@ class DistributedEkf:
 
     def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
         """Predict to the tick and correct with its regional rows."""
-        if self._tick is not None and tick != self._tick + 1:
-            raise ValueError(f"tick {tick} after {self._tick}: ticks grow by one")
-        first = self._tick is None
-        self._tick = tick
-        if first:
-            self.window.first = tick
-        self.window.advance(tick)
-        late = measurements["tick"] < tick
-        self.window.dropped += int(np.count_nonzero(late))
-        self.window.insert(measurements[~late], inputs)
+        first = self.window.open(tick)
+        self.window.insert_current(measurements, inputs)
         rows, start = self.window.rows()
         rows = rows[start[-2] :]
         accel, variance = self.window.inputs()

@@ -68,7 +68,6 @@ class MovingHorizonEstimator:
         self._pending: Pairs | None = None
         """The last round of consensus, which `solve` fuses in the same call as the rest of its step."""
         self._keep: IntArray = np.array([slot], np.int64)
-        self._tick: int | None = None
         self._rank = 0
         self._ranks: dict[int, int] = {}
         self._degree = 0
@@ -84,12 +83,7 @@ class MovingHorizonEstimator:
 
     def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
         """Open a tick: slide the window, insert what arrived, compute the observability rank (24)-(25)."""
-        if self._tick is not None and tick != self._tick + 1:
-            raise ValueError(f"tick {tick} after {self._tick}: ticks grow by one")
-        if self._tick is None:
-            self.window.first = tick
-        self._tick = tick
-        self.window.advance(tick)
+        self.window.open(tick)
         self.window.insert(measurements, inputs)
         self._pair = (self.prior_information, self.prior_information @ self.prior_mean)
         self._pending = None
@@ -128,7 +122,6 @@ class MovingHorizonEstimator:
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Solve the window (5)-(10) and move the arrival cost (17)-(18)."""
-        assert self._tick is not None, "begin() opens a tick"
         if self.window.last == self.window.first:
             return self._first_estimate()
         problem = self._problem()

@@ -56,6 +56,16 @@ class MeasurementWindow:
         self._origin: int | None = None
         self._last_heard = np.full(layout.size, np.iinfo(np.int64).min, np.int64)
 
+    def open(self, tick: int) -> bool:
+        """Move the window's end to the next tick; True at the very first. Raises ``ValueError`` on a leap."""
+        first = self._origin is None
+        if first:
+            self.first = tick
+        elif tick != self.last + 1:
+            raise ValueError(f"tick {tick} after {self.last}: ticks grow by one")
+        self.advance(tick)
+        return first
+
     def advance(self, tick: int) -> None:
         """Move the end of the window to ``tick``; what falls out at the start is forgotten."""
         self.last = tick
@@ -85,6 +95,12 @@ class MeasurementWindow:
         merged[: len(self._rows)], merged[len(self._rows) :] = self._rows, kept
         merged = merged[np.lexsort([merged[key] for key in _SORT_KEYS])]
         self._rows = merged[_first_of_each(merged)]
+
+    def insert_current(self, rows: RowTable, inputs: InputTable) -> None:
+        """For a filter, which has no past to put late rows into: those of earlier ticks are dropped, counted."""
+        late = rows["tick"] < self.last
+        self.dropped += int(np.count_nonzero(late))
+        self.insert(rows[~late], inputs)
 
     def _insert_inputs(self, inputs: InputTable) -> None:
         for sample in np.asarray(inputs, INPUT):

@@ -228,3 +228,18 @@ def test_fuzzed_datagrams_are_all_accounted_for_and_change_nothing(bench: Callab
     assert (b.session.reboots, b.session.state) == before[1:]
     b.run(1)
     assert len(b.of(ImuSample)) == pytest.approx(100, abs=2)
+
+
+def test_frames_of_other_systems_are_not_heard_as_the_autopilot(bench: Callable[..., Bench]) -> None:
+    # GIVEN a connected autopilot, WHEN sound frames of another system come on the same link
+    b = bench()
+    b.run(1)
+    heard = b.session.heard
+    assert heard > 0
+    stranger = Encoder(77, 1)
+    b.session.receive(stranger.encode(mavlink.MAVLink_heartbeat_message(2, PX4, 0, 0, 4, 3)), b.now_s)
+    b.session.receive(stranger.encode(mavlink.MAVLink_attitude_quaternion_message(1, 1, 0, 0, 0, 0, 0, 0)), b.now_s)
+    # THEN the link has no reason to answer them instead
+    assert b.session.heard == heard
+    b.run(1)
+    assert b.session.heard > heard

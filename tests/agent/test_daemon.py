@@ -22,6 +22,7 @@ from agent.config_tables import FleetConfig
 from agent.daemon import Daemon, run
 from agent.exit_codes import ExitCode
 from agent.logs import configure_logging
+from agent.mavlink_codec import Encoder, mavlink
 from agent.recording import read_record
 from estimators.estimator import Status
 from estimators.factory import make_estimator
@@ -198,6 +199,27 @@ async def test_two_daemons_find_their_autopilots_and_each_other(
         flight.cancel()
     await asyncio.gather(*flights, return_exceptions=True)
     check_records(tmp_path / "rec")
+
+
+async def test_a_stranger_on_the_mavlink_port_gets_none_of_the_autopilots_frames(config_of: Any) -> None:
+    # GIVEN a daemon, WHEN a vehicle of another system id sends it sound frames
+    config = config_of(1, "security.mode=unsigned")
+    daemon = Daemon(config, 1, make_estimator, Path())
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: daemon.summary()["counters"]["mavlink opened"] == 1, "the open link")
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
+        stranger.setblocking(False)
+        beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+        address = config.agent(1).mavlink.removeprefix("udpin:").split(":")
+        stranger.sendto(Encoder(77, 1).encode(beat), (address[0], int(address[1])))
+        await until(lambda: daemon.summary()["counters"].get("mavlink ignored heartbeat: other system") == 1, "it")
+        sent = daemon.summary()["counters"]["mavlink tx dropped"]
+        # THEN our heartbeats still are for nobody, until the autopilot speaks
+        await until(lambda: daemon.summary()["counters"]["mavlink tx dropped"] > sent, "a heartbeat for nobody")
+        with pytest.raises(BlockingIOError):
+            stranger.recv(512)
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
 
 
 def check_records(directory: Path) -> None:

@@ -55,6 +55,14 @@ def gps(**changed: Any) -> Any:
     return mavlink.MAVLink_gps_raw_int_message(**{**fields, **changed})
 
 
+@pytest.mark.parametrize("force_mps2", [1e30, -1000.5])
+def test_what_no_imu_can_measure_is_no_sample(force_mps2: float) -> None:
+    made = adapter()
+    assert convert(made, highres(x=force_mps2)) is None
+    assert made.skipped == {"imu: out of range": 1}
+    assert convert(made, highres(x=-999.5)) is not None
+
+
 def test_highres_imu_is_si_already() -> None:
     sample = convert(adapter(), highres())
     assert isinstance(sample, ImuSample)

@@ -1,0 +1,390 @@
+"""A hostile peer against a running daemon: what is refused and counted, and what it costs; see docs/robustness.md.
+
+``python -m tests.fleet.fuzz_daemon --packets 100000 --datagrams 100000 --seed 0`` from the root of the repository
+flies line3 with signed packets on free loopback ports and fuzzes agent 2, in the middle of the line, over a real
+Zenoh session and over its MAVLink port. Everything sent has to be found again in the daemon's own counters.
+"""
+
+from __future__ import annotations
+
+import argparse
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import zenoh
+from numpy.typing import NDArray
+
+from agent.config import load_config
+from agent.config_tables import FleetConfig
+from agent.endpoints import parse_endpoint
+from fleetloc import run_files
+from fleetloc.fleet_results import Results, load_results
+from fleetloc.lockstep_run import fly_in_lockstep
+from fleetloc.output import print_table, write_json
+from fleetloc.processes import resident_mb
+from tests.fleet.fuzz_traffic import (
+    CAPTURED_FOR_S,
+    HEARD,
+    NEIGHBOURS,
+    NEVER_ARRIVE,
+    REJECTED,
+    REJECTED_UWB,
+    TARGET,
+    UNHEARD,
+    Captured,
+    Datagram,
+    DatagramMaker,
+    PacketMaker,
+)
+from tests.support.fleet_process import FleetProcess, on_free_ports, until, with_overrides
+from transport.header import HEADER_BYTES, SIGNATURE_BYTES
+from transport.keys import init_keys
+from transport.report_body import Diagnostics, decode_diagnostics
+from transport.session_settings import SessionSettings, zenoh_config
+from transport.streams import Stream, key_expression, parse_key
+
+BURST_S = 0.005
+SETTLE_S, DRAIN_S = 2 * CAPTURED_FOR_S, 3.0
+MAX_ERROR_FACTOR, MAX_GROWTH_MB, MIN_ON_TIME = 1.5, 8.0, 0.95
+SHARED = "timesync rejected"
+"""The autopilot's own answers are counted here too, if they take long on a busy machine: one question a second."""
+FLIGHT_S = 240.0
+"""Longer than any attack: the fleet is interrupted when it has been measured."""
+
+
+@dataclass(slots=True)
+class Attack:
+    """What was sent, and what was seen meanwhile; times are UTC in s."""
+
+    packets: Counter[str] = field(default_factory=Counter)
+    datagrams: Counter[str] = field(default_factory=Counter)
+    expected: Counter[str] = field(default_factory=Counter)
+    """What the daemon's counters have to have grown by, by name."""
+    before: dict[str, int] = field(default_factory=dict)
+    after: dict[str, int] = field(default_factory=dict)
+    begin_s: float = 0.0
+    end_s: float = 0.0
+    resident_mb: list[float] = field(default_factory=list)
+    """Of the daemon, about once a second, from before the attack to after it."""
+    socket_drops: int = 0
+    """Datagrams that the kernel dropped because the daemon's socket was full."""
+    unheard_matched: bool = False
+    """Whether anybody had subscribed to the streams that no daemon listens to."""
+
+
+class HostilePeer:
+    """A Zenoh session that anyone can open where links are not secured: it hears all, and puts on every key."""
+
+    def __init__(self, config: FleetConfig) -> None:
+        self._config = config
+        self.captured = Captured()
+        self._reports: list[Diagnostics] = []
+        endpoints = tuple(endpoint for agent_id in config.ids for endpoint in config.listen(agent_id))
+        settings = SessionSettings(connect=endpoints)
+        self.session = zenoh.open(zenoh_config(settings, config.fleet.name, None, config.ids))
+        keys = [self._key(agent_id, stream) for agent_id in NEIGHBOURS for stream in HEARD]
+        remote = zenoh.Locality.REMOTE  # what this peer puts itself is nothing captured
+        self._declared = [
+            self.session.declare_subscriber(key, self._on_sample, allowed_origin=remote)
+            for key in (*keys, self._key(TARGET, Stream.DIAG))
+        ]
+
+    def _key(self, agent_id: int, stream: Stream) -> str:
+        return key_expression(self._config.fleet.name, agent_id, stream)
+
+    def _on_sample(self, sample: zenoh.Sample) -> None:
+        parsed, packet = parse_key(str(sample.key_expr)), sample.payload.to_bytes()
+        assert parsed is not None
+        if parsed[2] is Stream.DIAG:
+            self._reports.append(decode_diagnostics(packet[HEADER_BYTES:-SIGNATURE_BYTES]))
+        else:
+            self.captured.add(parsed[1], parsed[2], packet)
+
+    def counters(self) -> dict[str, int]:
+        """What the daemon counted, in a report that is made after this call."""
+        heard = len(self._reports)
+        until(lambda: len(self._reports) > heard, "diagnostics of the fuzzed daemon", 30.0)
+        return dict(self._reports[-1].counters)
+
+    def put(self, key: str, payload: bytes) -> None:
+        """Put, waiting where the link is congested: whatever is missing later, it was not dropped here."""
+        if key == self._key(TARGET, Stream.CLOCK):
+            self.session.get(key, lambda _reply: None, payload=payload, timeout=1.0)
+        else:
+            blocking = zenoh.CongestionControl.BLOCK
+            self.session.put(key, payload, congestion_control=blocking, express=True)
+
+    def unheard_matched(self) -> bool:
+        """Whether a put on the streams that no daemon listens to would leave this process."""
+        keys = (self._key(agent_id, stream) for agent_id in NEIGHBOURS for stream in UNHEARD)
+        statuses = [self.session.declare_publisher(key).matching_status for key in keys]
+        return any(bool(getattr(status, "matching", status)) for status in statuses)
+
+    def close(self) -> None:
+        """Leave."""
+        self.session.close()  # type: ignore[no-untyped-call]
+
+
+def socket_drops(port: int) -> int:
+    """What the kernel dropped at the UDP socket bound to a port of this machine, so far."""
+    for line in Path("/proc/net/udp").read_text(encoding="ascii").splitlines()[1:]:
+        fields = line.split()
+        if int(fields[1].rpartition(":")[2], 16) == port:
+            return int(fields[-1])
+    raise AssertionError(f"no UDP socket on port {port}")
+
+
+@contextmanager
+def sampled_memory(pid: int, samples: list[float]) -> Iterator[None]:
+    """Note a process's resident memory once a second meanwhile."""
+    done = threading.Event()
+
+    def watch() -> None:
+        while not done.wait(1.0):
+            samples.append(resident_mb(pid) or float("nan"))
+
+    thread = threading.Thread(target=watch)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
+def send_all(
+    peer: HostilePeer, config: FleetConfig, packets: int, datagrams: list[Datagram], duration_s: float, seed: int
+) -> Attack:
+    """Send everything, evenly over the time, in small bursts."""
+    attack, endpoint = Attack(), parse_endpoint(config.agent(TARGET).mavlink)
+    maker = PacketMaker(config.fleet.name, peer.captured, np.random.default_rng(seed))
+    shots = maker.make(packets)
+    bursts = max(round(duration_s / BURST_S), 1)
+    begin_s, sent_packets, sent_datagrams = time.monotonic(), 0, 0
+    attack.begin_s = time.time()
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
+        for burst in range(1, bursts + 1):
+            while sent_packets < packets * burst // bursts:
+                name, (key, payload) = next(shots)
+                peer.put(key, payload)
+                attack.packets[name] += 1
+                sent_packets += 1
+            while sent_datagrams < len(datagrams) * burst // bursts:
+                datagram = datagrams[sent_datagrams]
+                udp.sendto(datagram.data, (endpoint.host, endpoint.port))
+                attack.datagrams[datagram.kind] += 1
+                attack.expected.update(datagram.counts)
+                sent_datagrams += 1
+            time.sleep(max(begin_s + burst * duration_s / bursts - time.monotonic(), 0.0))
+    attack.end_s = time.time()
+    attack.expected.update(maker.expected(attack.packets))
+    return attack
+
+
+def attack_fleet(
+    fleet: FleetProcess, packets: int, datagrams: list[Datagram], duration_s: float, seed: int
+) -> Attack:
+    """Wait until the fleet flies well, attack, wait until the daemon has worked off everything."""
+    until(fleet.flying, "flight")
+    until(lambda: f"agent {TARGET}: ok" in fleet.log(TARGET), "the daemon is aligned")
+    config = load_config(fleet.out / run_files.CONFIG)
+    peer, memory_mb = HostilePeer(config), list[float]()
+    port = parse_endpoint(config.agent(TARGET).mavlink).port
+    try:
+        with sampled_memory(fleet.pid_of(TARGET), memory_mb):
+            time.sleep(SETTLE_S)
+            before, drops = peer.counters(), socket_drops(port)
+            attack = send_all(peer, config, packets, datagrams, duration_s, seed)
+            time.sleep(DRAIN_S)
+            attack.before, attack.after = before, peer.counters()
+            attack.socket_drops = socket_drops(port) - drops
+            attack.unheard_matched = peer.unheard_matched()
+        attack.resident_mb = memory_mb
+    finally:
+        peer.close()
+    return attack
+
+
+# --- what has to hold ---------------------------------------------------------------------------------------
+
+
+def grown(attack: Attack) -> Counter[str]:
+    """By how much the daemon's counters grew, the rejected packets also summed."""
+    delta = Counter({name: n - attack.before.get(name, 0) for name, n in attack.after.items()})
+    delta[REJECTED_UWB] = sum(n for name, n in delta.items() if name.startswith("rejected uwb "))
+    rejected = (n for name, n in delta.items() if name.startswith("rejected ") and not name.startswith(REJECTED_UWB))
+    delta[REJECTED] = sum(rejected)
+    return delta
+
+
+def position_errors_m(results: Results, agent_id: int, begin_s: float, end_s: float) -> NDArray[np.float64]:
+    """Distances of an agent's own position from the truth between two times since the start of the world."""
+    track = next(track for track in results.tracks if track.agent_id == agent_id)
+    inside = (track.time_s >= begin_s) & (track.time_s < end_s) & track.known
+    return np.asarray(np.linalg.norm(track.own_error_m[inside], axis=1))
+
+
+def figures(config: FleetConfig, fleet: FleetProcess, attack: Attack, quiet_folder: Path) -> dict[str, Any]:
+    """What the run's files and counters tell, machine-readable."""
+    results = load_results(config, fleet.out)
+    begin_s, end_s = (t - results.start_unix_s for t in (attack.begin_s, attack.end_s))
+    quiet = quiet_results(config, quiet_folder, end_s)
+    agents = []
+    for track in results.tracks:
+        inside = (track.time_s >= begin_s) & (track.time_s < end_s)
+        rmse_m, quiet_m = (
+            float(np.sqrt(np.mean(position_errors_m(run, track.agent_id, begin_s, end_s) ** 2)))
+            for run in (results, quiet)
+        )
+        expected = int((end_s - begin_s) / results.period_s)
+        agents.append(
+            {
+                "id": track.agent_id,
+                "ticks_expected": expected,
+                "ticks_on_time": int(np.count_nonzero(track.on_time & inside)),
+                "ticks_without_estimate": int(np.count_nonzero(~track.known & inside)),
+                "late_packets": late_packets(fleet, track.agent_id),
+                "all_finite": bool(np.isfinite(track.full_error).all() and np.isfinite(track.own_sigma_m).all()),
+                "position_rmse_m": rmse_m,
+                "quiet_position_rmse_m": quiet_m,
+                "error_factor": rmse_m / quiet_m,
+                "log_has_traceback": "Traceback" in fleet.log(track.agent_id),
+            }
+        )
+    delta, mb = grown(attack), attack.resident_mb
+    return {
+        "duration_s": attack.end_s - attack.begin_s,
+        "packets": {"sent": attack.packets.total(), "by_class": dict(attack.packets)},
+        "datagrams": {"sent": attack.datagrams.total(), "by_class": dict(attack.datagrams)},
+        "counters": {name: {"expected": n, "found": delta[name]} for name, n in sorted(attack.expected.items())},
+        "rejected_by_reason": {n: v for n, v in sorted(delta.items()) if n.startswith("rejected ") and v},
+        "packets_shed": delta["packets shed"],
+        "packets_lost_of_neighbours": delta["packets lost"],
+        "program_faults": delta["program faults"],
+        "reboots": delta["mavlink reboots"],
+        "socket_drops": attack.socket_drops,
+        "unheard_streams_matched": attack.unheard_matched,
+        "resident_mb_before": mb[int(SETTLE_S) - 2],
+        "resident_mb_after": mb[-1],
+        "resident_mb": mb,
+        "agents": agents,
+    }
+
+
+def late_packets(fleet: FleetProcess, agent_id: int) -> int:
+    """Of neighbours, in the whole run: too late for their tick, so used for a later one or not at all."""
+    summary = run_files.record_path(fleet.out, agent_id).with_suffix(run_files.SUMMARY_SUFFIX)
+    counters = msgspec.json.decode(summary.read_bytes())["counters"]
+    return sum(int(counters.get(f"{kind}: late", 0)) for kind in ("measurements", "information"))
+
+
+def quiet_results(config: FleetConfig, folder: Path, duration_s: float) -> Results:
+    """The same world without an attack, in virtual time."""
+    replace = msgspec.structs.replace
+    quiet = replace(config, sim=replace(config.sim, duration_s=float(np.ceil(duration_s)) + 1.0))
+    folder.mkdir()
+    fly_in_lockstep(quiet, folder)
+    return load_results(quiet, folder)
+
+
+def complaints(result: dict[str, Any]) -> list[str]:
+    """What does not hold; empty for a daemon that withstood."""
+    found = []
+    for name, counts in result["counters"].items():
+        excess = counts["found"] - counts["expected"]
+        may_exceed = 2.0 * result["duration_s"] + 20 if name == SHARED else 0
+        if name not in NEVER_ARRIVE and not 0 <= excess <= may_exceed:
+            found.append(f"{name}: expected {counts['expected']}, counted {counts['found']}")
+    for name in ("packets_shed", "packets_lost_of_neighbours", "program_faults", "reboots", "socket_drops"):
+        if result[name]:
+            found.append(f"{name}: {result[name]}")
+    if result["unheard_streams_matched"]:
+        found.append("a stream that no daemon should listen to has a subscriber")
+    growth_mb = result["resident_mb_after"] - result["resident_mb_before"]
+    if growth_mb > MAX_GROWTH_MB:
+        found.append(f"resident memory grew by {growth_mb:.1f} MB, at most {MAX_GROWTH_MB:g} allowed")
+    for agent in result["agents"]:
+        who = f"agent {agent['id']}"
+        if not agent["all_finite"] or agent["ticks_without_estimate"]:
+            found.append(f"{who}: estimates missing or not finite")
+        if agent["error_factor"] > MAX_ERROR_FACTOR:
+            found.append(f"{who}: own position error {agent['error_factor']:.2f} times that without attack")
+        if agent["ticks_on_time"] < MIN_ON_TIME * agent["ticks_expected"]:
+            found.append(f"{who}: {agent['ticks_on_time']} of {agent['ticks_expected']} ticks on time")
+        if agent["log_has_traceback"]:
+            found.append(f"{who}: a traceback in its log")
+    return found
+
+
+def fuzz(folder: Path, packets: int, datagrams: int, duration_s: float, seed: int) -> dict[str, Any]:
+    """One whole run in an empty folder; the figures, with ``complaints``."""
+    made = list(DatagramMaker(np.random.default_rng((seed, 1))).make(datagrams))
+    init_keys(folder / "keys", (1, 2, 3))
+    overrides = [*on_free_ports(3), "security.mode=signed", f"security.keys={folder / 'keys'}"]
+    options = ("--duration", str(FLIGHT_S), "--seed", "1")
+    fleet = FleetProcess(folder / "run", *with_overrides(overrides), *options)
+    try:
+        attack = attack_fleet(fleet, packets, made, duration_s, seed)
+        fleet.interrupt()
+        code, _, stderr = fleet.finish()
+        config = load_config(fleet.out / run_files.CONFIG)
+        result = figures(config, fleet, attack, folder / "quiet")
+    finally:
+        fleet.clean_up()
+    result["exit_code"] = code
+    result["complaints"] = complaints(result) + ([f"fleet ended with {code}: {stderr}"] if code else [])
+    return result
+
+
+def show(result: dict[str, Any]) -> None:
+    """Tables for people."""
+    for what in ("packets", "datagrams"):
+        rows = [[name, str(n)] for name, n in result[what]["by_class"].items()]
+        print_table([what, "sent"], [*sorted(rows), ["all", str(result[what]["sent"])]])
+    rows = [[name, str(c["expected"]), str(c["found"])] for name, c in result["counters"].items()]
+    print_table(["counter of the daemon", "expected", "found"], rows)
+    print_table(["refused", "packets"], [[name, str(n)] for name, n in result["rejected_by_reason"].items()])
+    columns = ["agent", "ticks on time", "RMSE m", "without attack m", "factor", "late packets"]
+    rows = [
+        [str(a["id"]), f"{a['ticks_on_time']}/{a['ticks_expected']}", f"{a['position_rmse_m']:.3f}",
+         f"{a['quiet_position_rmse_m']:.3f}", f"{a['error_factor']:.2f}", str(a["late_packets"])]
+        for a in result["agents"]
+    ]  # fmt: skip
+    print_table(columns, rows)
+    rest = ("packets_shed", "packets_lost_of_neighbours", "socket_drops", "program_faults", "reboots",
+            "resident_mb_before", "resident_mb_after", "duration_s")  # fmt: skip
+    print_table(["", ""], [[name, f"{result[name]:.1f}".removesuffix(".0")] for name in rest])
+
+
+def main() -> int:
+    """The command; the exit code says whether the daemon withstood."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--packets", type=int, default=100_000)
+    parser.add_argument("--datagrams", type=int, default=100_000)
+    parser.add_argument("--duration", type=float, default=60.0, help="seconds that the attack takes")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--json", type=Path)
+    options = parser.parse_args()
+    with tempfile.TemporaryDirectory() as folder:
+        result = fuzz(Path(folder), options.packets, options.datagrams, options.duration, options.seed)
+    show(result)
+    if options.json is not None:
+        write_json(options.json, result)
+    for complaint in result["complaints"]:
+        sys.stderr.write(f"fuzz_daemon: {complaint}\n")
+    return 1 if result["complaints"] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -35,7 +35,7 @@ from agent.config_tables import TransportTable as TransportTable
 from agent.config_tables import WaypointsPath as WaypointsPath
 from agent.endpoints import SPELLINGS, LinkKind, parse_endpoint
 from agent.errors import ConfigError, EndpointError
-from estimators.settings import EstimatorSettings
+from estimators.settings import EstimatorSettings, with_kind_defaults
 
 MAX_FILE_BYTES = 1_000_000
 IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
@@ -104,6 +104,8 @@ def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] =
     """The checked configuration of a decoded TOML document; ``where`` names it in errors."""
     overridden = {_override(document, override) for override in overrides}
     _check_finite(document, where, "")
+    if isinstance(document.get("estimator"), dict):
+        document = document | {"estimator": with_kind_defaults(document["estimator"])}
     try:
         config = msgspec.convert(document, FleetConfig)
     except msgspec.ValidationError as error:

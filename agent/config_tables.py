@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from estimators.settings import EstimatorSettings
+from estimators.settings import EstimatorSettings, default_settings
 
 AgentId = Annotated[int, msgspec.Meta(ge=1, le=999)]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
@@ -270,7 +270,7 @@ class FleetConfig(Table, frozen=True):
 
     fleet: FleetTable
     agents: Annotated[tuple[AgentTable, ...], msgspec.Meta(min_length=1, max_length=999)]
-    estimator: EstimatorSettings = msgspec.field(default_factory=EstimatorSettings)
+    estimator: EstimatorSettings = msgspec.field(default_factory=default_settings)
     sensors: SensorsTable = msgspec.field(default_factory=SensorsTable)
     initial: InitialTable = msgspec.field(default_factory=InitialTable)
     mavlink: MavlinkTable = msgspec.field(default_factory=MavlinkTable)

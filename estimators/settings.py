@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from collections.abc import Mapping
+from typing import Annotated, Any, Literal
 
 import msgspec
 
@@ -10,9 +11,26 @@ Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
+DEFAULT_KIND: Kind = "dmhe_relay"
+"""What runs where nothing is said; docs/algorithms.md says why."""
+DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
+    "dmhe_relay": {
+        "window": 6,  # ticks that a late or repeated record may take
+        "rounds": 2,  # a record moves as many hops in a tick
+        "share_inputs": "fleet",
+        "relay_hops": 2,
+        "unknown_inputs": "hold",  # the last acceleration heard, with a variance that grows
+    }
+}
+"""Defaults that go with a kind; of every other kind those of `EstimatorSettings`, which are the paper's."""
+
 
 class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Settings of one estimator; every agent of a fleet runs the same."""
+    """Settings of one estimator; every agent of a fleet runs the same.
+
+    The defaults of the fields are those of the paper's estimator. A configuration gets those of its ``kind``
+    through `with_kind_defaults`, `default_settings` is what it gets without a word.
+    """
 
     kind: Kind = "dmhe_pre_ekf"
     """Algorithm."""
@@ -70,3 +88,15 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     tolerance: Positive = 1e-6
     """Convergence: largest change of a state component, m or m/s, still expected from another iteration."""
+
+
+def with_kind_defaults(table: Mapping[str, Any]) -> dict[str, Any]:
+    """An ``[estimator]`` table as it was written, completed by its kind and that kind's own defaults."""
+    kind = table.get("kind", DEFAULT_KIND)
+    own = DEFAULTS_OF_KIND.get(kind, {}) if isinstance(kind, str) else {}
+    return {"kind": kind, **own, **table}
+
+
+def default_settings() -> EstimatorSettings:
+    """The settings of a configuration that says nothing about the estimator."""
+    return msgspec.convert(with_kind_defaults({}), EstimatorSettings)

@@ -7,9 +7,10 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import config_from, dump, load_config
+from agent.config import config_from, dump, load_config, load_estimator_settings
 from agent.config_tables import CirclePath
 from agent.errors import ConfigError
+from estimators.settings import EstimatorSettings
 
 CONFIGS = sorted((Path(__file__).parents[2] / "configs").glob("*.toml"))
 LINE3 = next(path for path in CONFIGS if path.stem == "line3")
@@ -137,3 +138,14 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
         load_config(broken)
     with pytest.raises(ConfigError, match="at most 1000000 bytes"):
         load_config(huge)
+
+
+def test_a_kind_brings_its_own_defaults_and_what_is_written_beats_them() -> None:
+    nothing_said = load_estimator_settings(None)
+    assert (nothing_said.kind, nothing_said.window, nothing_said.relay_hops) == ("dmhe_relay", 6, 2)
+    assert nothing_said == load_config(LINE3).estimator
+    paper = load_estimator_settings(None, ["estimator.kind=dmhe_pre_ekf"])
+    assert paper == EstimatorSettings()
+    assert (paper.window, paper.rounds, paper.share_inputs, paper.relay_hops) == (2, 1, "none", 0)
+    longer = load_estimator_settings(None, ["estimator.window=9"])
+    assert (longer.kind, longer.window, longer.share_inputs) == ("dmhe_relay", 9, "fleet")

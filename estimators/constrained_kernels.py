@@ -204,7 +204,10 @@ def _invert_upper(u: Matrix, out: Matrix) -> None:
 def _bound_slopes(
     window: Window, path: Trajectory, bounds_on: int, sensitivities: Matrix, out: Matrix
 ) -> None:
-    """Derivatives of the bounded residuals: -C dx/dz after correction, or before it (innovations)."""
+    """Derivatives of the bounded residuals: -C dx/dz after correction, or before it (innovations).
+
+    Innovations are bounded only with gains (`estimators.constrained.bound_kind`): z is then the first state alone.
+    """
     d = window.prior_mean.shape[0]
     out[:, :] = 0.0
     for k in range(1, window.start.shape[0] - 1):
@@ -213,11 +216,6 @@ def _bound_slopes(
         else:
             sens = sensitivities[(k - 1) * d : k * d].copy()
             predict_sensitivity(sens, window.dt)
-            for i in range(window.noise_precision.shape[1]):
-                column = d + (k - 1) * (d // 2) + i
-                row = 6 * (i // 3) + i % 3
-                sens[row, column] += 0.5 * window.dt * window.dt
-                sens[row + 3, column] += window.dt
         units = path.units if bounds_on == CORRECTED else path.predicted_units
         for r in range(window.start[k], window.start[k + 1]):
             chain_gradient(window.code, window.data, r, units[r], sens, out[r])

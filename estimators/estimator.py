@@ -23,6 +23,7 @@ class Status(IntEnum):
     FELL_BACK = 2
     """The solver failed: the pre-estimate (or the last good prediction) is given."""
     NOT_OBSERVABLE = 3
+    """The data do not say where the agent itself is, or allow more than one place; the covariance covers them."""
     NO_DATA = 4
     """Nothing was measured or received: the prediction is given."""
 
@@ -69,6 +70,8 @@ class Estimate:
 
     ``mean`` ``(6n,)`` and ``covariance`` ``(6n, 6n)`` in NED m and m/s, blocks in the order of the layout;
     ``age_ticks`` ``(n,)``: ticks since anything measured by that agent last entered this estimate.
+    ``observable`` ``(n,)``: whether what was measured, without the prior, says where each agent is; all true where
+    the algorithm does not tell.
     """
 
     tick: int
@@ -77,6 +80,11 @@ class Estimate:
     status: Status
     age_ticks: NDArray[np.int64]
     report: SolverReport = field(default_factory=SolverReport)
+    observable: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
+
+    def __post_init__(self) -> None:
+        if not len(self.observable):
+            object.__setattr__(self, "observable", np.ones(len(self.age_ticks), np.bool_))
 
 
 class Estimator(Protocol):

@@ -16,16 +16,18 @@ CHANGES_NEEDED = 3
 class InputHistory:
     """Known accelerations per tick and agent; what arrives first counts.
 
-    An unknown one is zero with ``other_variance`` per axis, or, with ``hold``, the agent's last known one. Its
-    variance then grows with the square of the ticks it is held: by the mean square change per tick that the
-    agent's known accelerations show, and never beyond ``other_variance``. Everything follows from what is
-    stored, so that the order of arrival does not matter.
+    An unknown one is zero with ``other_variance`` per axis, or, with ``hold``, the agent's last known one times
+    ``fade`` for every tick since (1: as it was; less: exponentially correlated acceleration, Singer 1970). Its
+    variance then grows with the square of the ticks it is held: by the mean square error of that prediction over
+    one tick that the agent's known accelerations show, and never beyond ``other_variance``. Everything follows
+    from what is stored, so that the order of arrival does not matter.
     """
 
-    def __init__(self, agents: int, other_variance: float, *, hold: bool) -> None:
+    def __init__(self, agents: int, other_variance: float, *, hold: bool, fade: float = 1.0) -> None:
         self._known: list[dict[int, tuple[Vector, Vector]]] = [{} for _ in range(agents)]
         self._other_variance = other_variance
         self._hold = hold
+        self._fade = fade
 
     def insert(self, tick: int, slot: int, accel: Vector, variance: Vector) -> None:
         """Store an acceleration ``(3,)``, NED m/s2, over the tick that starts at ``tick``, and its variance."""
@@ -60,10 +62,11 @@ class InputHistory:
             return None
         last = max(before)
         accel, variance = known[last]
-        return accel, np.minimum(variance + change * (tick - last) ** 2, self._other_variance)
+        held = tick - last
+        return accel * self._fade**held, np.minimum(variance + change * held**2, self._other_variance)
 
     def _mean_square_change(self, slot: int) -> float | None:
-        """Mean square change per tick and axis of an agent's acceleration, its sensor's noise included."""
+        """Mean square per axis of what a tick changes beyond the fading, the sensor's noise included."""
         known = self._known[slot]
-        changes = [known[tick + 1][0] - accel for tick, (accel, _) in known.items() if tick + 1 in known]
+        changes = [known[tick + 1][0] - self._fade * accel for tick, (accel, _) in known.items() if tick + 1 in known]
         return float(np.mean(np.square(changes))) if len(changes) >= CHANGES_NEEDED else None

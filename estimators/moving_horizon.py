@@ -18,7 +18,7 @@ from estimators.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.motion import predict_mean
 from estimators.observability import observability_rank
 from estimators.row_kernels import IntArray
-from estimators.settings import EstimatorSettings
+from estimators.settings import EstimatorSettings, fade_per_tick
 from estimators.window import MeasurementWindow
 from estimators.window_solver import pre_estimation, solve_window
 from estimators.window_types import NO_PAIRS, WindowProblem, WindowSolution
@@ -59,6 +59,7 @@ class MovingHorizonEstimator:
             other_accel_variance=settings.other_accel_variance,
             reciprocal_ranges=settings.reciprocal_ranges,
             unknown_inputs=settings.unknown_inputs,
+            held_accel_fade=fade_per_tick(settings, period_s),
         )
         self.prior_mean = np.array(prior_mean, float)
         """Mean at the window's start: before consensus until `solve`, which replaces it by (16)."""

@@ -3,6 +3,10 @@
 Records and inputs travel over hops, so that the window of every agent holds what the fleet measured and each
 solves the central problem. The window is DMHE-1's (input corrections as variables); its arrival cost is
 filtered, so that nothing is used twice; consensus on it only repairs what was lost on the way.
+
+What an arrival cost holds is never linearised anew. So a range between places that are not known well enters it
+with what its linearisation misses (`estimators.second_order`), and a drone without fixes has a witness that keeps
+other places in mind (`estimators.witness`).
 """
 
 from __future__ import annotations
@@ -11,17 +15,48 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from estimators.estimator import Estimate, Payload, SolverReport, Status
+from estimators.data_information import DataInformation
+from estimators.estimator import Estimate, Payload, SolverReport, Status, symmetrised
 from estimators.information import usable_pairs
 from estimators.inheritance import inherit
+from estimators.layout import Layout, block
 from estimators.marginalization import filter_along
-from estimators.measurements import Vector
+from estimators.measurements import Kind, Matrix, Vector
+from estimators.motion import input_matrix, transition_matrix
 from estimators.moving_horizon import MovingHorizonEstimator
+from estimators.second_order import linearisation_variance
+from estimators.settings import EstimatorSettings
 from estimators.window_types import WindowProblem, WindowSolution
+from estimators.witness import Body, Opinion, Witness, body_of, own_rows
+
+SIGNIFICANT = 0.05
+"""Share of a row's variance below which what its linearisation misses is left out."""
+REWEIGHTINGS = 3
+"""How often the covariance and what the linearisation misses at it are computed from each other."""
+RESEATED_SPREAD = 2.0
+"""Factor on the covariance of a place taken over from the witness: the window's rows are in it already."""
 
 
 class RelayMovingHorizonEstimator(MovingHorizonEstimator):
     """One agent's ``dmhe_relay``; arguments as in `estimators.factory.make_estimator`."""
+
+    def __init__(
+        self,
+        settings: EstimatorSettings,
+        layout: Layout,
+        slot: int,
+        prior_mean: Vector,
+        prior_covariance: Matrix,
+        period_s: float,
+    ) -> None:
+        super().__init__(settings, layout, slot, prior_mean, prior_covariance, period_s)
+        self._covariance = symmetrised(np.asarray(prior_covariance, float))
+        self._data = DataInformation(layout.size)
+        self._observable = np.ones(layout.size, np.bool_)
+        self._own: Body = body_of(self.prior_mean, self._covariance, slot)
+        self._witness = Witness(slot, self._own, period_s)
+        self.switches = 0
+        """How often the own state was moved to the only place that the data allow."""
 
     def _observability_rank(self) -> int:
         """Not used: consensus here has no weights."""
@@ -43,33 +78,102 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
 
     def _slide(self, problem: WindowProblem, solution: WindowSolution) -> None:
         """Marginalise the oldest tick where the window is full; keep the covariance of the newest."""
-        n = len(problem.vector)
-        information, vector, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
-        sound = filter_along(
-            problem.rows,
-            problem.start,
-            problem.accel,
-            problem.accel_variance,
-            np.ascontiguousarray(solution.path),
-            self.period_s,
-            self.settings.norm_smoothing_m,
-            problem.information,
-            problem.vector,
-            information,
-            vector,
-            covariance,
-        )
-        if not sound:
-            raise ArithmeticError("the window's information is not positive definite")
-        self._covariance = 0.5 * (covariance + covariance.T)
+        information, vector = self._filter(problem, solution.path)
+        full = self.window.last - self.window.first == self.settings.window
+        self._observable = self._data.advance(problem, solution.path, self.settings.norm_smoothing_m, slide=full)
         self._path = list(solution.path)
-        if self.window.last - self.window.first < self.settings.window:  # the start stays
+        if not full:  # the start stays
             information, vector = problem.information, problem.vector
         self.prior_information = np.ascontiguousarray(information)
         self.prior_mean = np.asarray(np.linalg.solve(information, vector), np.float64)
+
+    def _filter(self, problem: WindowProblem, path: Matrix) -> tuple[Matrix, Vector]:
+        """The pair one tick after the window's start; sets the covariance at its end.
+
+        What the rows' linearisation misses follows from the covariance and it from that: iterated from the rows as
+        they are, so that a place that the data tell is not doubted for the prior's sake. The rows of ``problem`` get
+        the variances found.
+        """
+        n = len(problem.vector)
+        information, vector, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
+        path = np.ascontiguousarray(path)
+        measured = problem.rows
+        at = path[np.repeat(np.arange(len(path)), np.diff(problem.start))]
+        for _ in range(REWEIGHTINGS + 1):
+            sound = filter_along(
+                problem.rows,
+                problem.start,
+                problem.accel,
+                problem.accel_variance,
+                path,
+                self.period_s,
+                self.settings.norm_smoothing_m,
+                problem.information,
+                problem.vector,
+                information,
+                vector,
+                covariance,
+            )
+            if not sound:
+                raise ArithmeticError("the window's information is not positive definite")
+            missed = linearisation_variance(measured, at, covariance, self.settings.norm_smoothing_m)
+            total = measured["variance"] + np.where(missed > SIGNIFICANT * measured["variance"], missed, 0.0)
+            if np.allclose(total, problem.rows["variance"], rtol=SIGNIFICANT, atol=0.0):
+                break
+            problem.rows = measured.copy()
+            problem.rows["variance"] = total
+        self._covariance = symmetrised(covariance)
+        return information, vector
 
     def _estimate(self, problem: WindowProblem, mean: Vector, status: Status, report: SolverReport) -> Estimate:
         """The smoothed newest state with the covariance of the filter along the window."""
         if status is Status.OK and not len(problem.rows):
             status = Status.NO_DATA
-        return Estimate(self.window.last, mean, self._covariance, status, self.window.ages(), report)
+        covariance, observable = self._covariance, self._observable
+        opinion = self._second_opinion(problem, mean)
+        if opinion is not None and opinion.ambiguous:
+            observable = observable.copy()
+            observable[self.slot] = False
+        if opinion is not None and opinion.understated:
+            covariance = covering(covariance, opinion.second_moment, self.slot)
+        if opinion is not None and opinion.elsewhere is not None:
+            self._move(opinion.elsewhere, problem)
+        if not observable[self.slot] and status in (Status.OK, Status.NOT_CONVERGED):
+            status = Status.NOT_OBSERVABLE
+        return Estimate(self.window.last, mean, covariance, status, self.window.ages(), report, observable)
+
+    def _second_opinion(self, problem: WindowProblem, mean: Vector) -> Opinion | None:
+        """Let the witness see the newest tick, and ask it about the estimate."""
+        mine = slice(3 * self.slot, 3 * self.slot + 3)
+        rows, start = self.window.rows()
+        newest = own_rows(rows[start[-2] :], self.slot)
+        fixed = bool(((rows["kind"] == Kind.POSITION) & (rows["agent"] == self.slot)).any())
+        self._witness.advance(newest, problem.accel[-1, mine], problem.accel_variance[-1, mine], fixed, self._own)
+        self._own = body_of(mean, self._covariance, self.slot)
+        located = np.flatnonzero(self._observable)
+        bodies = {int(s): body_of(mean, self._covariance, int(s)) for s in located if s != self.slot}
+        self._witness.see(newest, bodies)
+        return self._witness.judge(self._own)
+
+    def _move(self, there: Body, problem: WindowProblem) -> None:
+        """Put the own block of the arrival cost where the witness is sure to be, carried back through the window."""
+        self.switches += 1
+        mine, own = slice(3 * self.slot, 3 * self.slot + 3), block(self.slot)
+        back, push = transition_matrix(1, -self.period_s), input_matrix(1, self.period_s)
+        mean, spread = there[0], RESEATED_SPREAD * there[1]
+        full = self.window.last - self.window.first == self.settings.window
+        for k in range(len(problem.accel) - 1, 0 if full else -1, -1):
+            mean = back @ (mean - push @ problem.accel[k, mine])
+            spread = back @ (spread + (push * problem.accel_variance[k, mine]) @ push.T) @ back.T
+        covariance = covering(symmetrised(np.linalg.inv(self.prior_information)), spread, self.slot)
+        self.prior_mean[own] = mean
+        self.prior_information = symmetrised(np.linalg.inv(covariance))
+
+
+def covering(covariance: Matrix, own: Matrix, slot: int) -> Matrix:
+    """The fleet's covariance with another one of the own state ``(6, 6)``, uncorrelated with the others."""
+    out = covariance.copy()
+    out[block(slot), :] = 0.0
+    out[:, block(slot)] = 0.0
+    out[block(slot), block(slot)] = own
+    return symmetrised(out)

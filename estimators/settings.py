@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from typing import Annotated, Any, Literal
 
@@ -20,6 +21,7 @@ DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
         "share_inputs": "fleet",
         "relay_hops": 2,
         "unknown_inputs": "hold",  # the last acceleration heard, with a variance that grows
+        "held_accel_fade_s": 2.0,  # no vehicle accelerates for long
     }
 }
 """Defaults that go with a kind; of every other kind those of `EstimatorSettings`, which are the paper's."""
@@ -28,8 +30,8 @@ DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
 class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of one estimator; every agent of a fleet runs the same.
 
-    The defaults of the fields are those of the paper's estimator. A configuration gets those of its ``kind``
-    through `with_kind_defaults`, `default_settings` is what it gets without a word.
+    The defaults are those of the paper's estimator, but where a configuration's ``kind`` brings its own
+    (`DEFAULTS_OF_KIND`).
     """
 
     kind: Kind = "dmhe_pre_ekf"
@@ -55,6 +57,9 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     unknown_inputs: Literal["zero", "hold"] = "zero"
     """What stands for an acceleration that is not known: zero, or the last one heard from that agent."""
+
+    held_accel_fade_s: Positive | None = None
+    """Time constant with which a held acceleration fades to zero; absent = it stays (``unknown_inputs = "hold"``)."""
 
     norm_smoothing_m: Positive = 1e-3
     """eps of the smoothed norms sqrt(|.|^2 + eps^2), in m for ranges and m/s for speeds."""
@@ -100,3 +105,8 @@ def with_kind_defaults(table: Mapping[str, Any]) -> dict[str, Any]:
 def default_settings() -> EstimatorSettings:
     """The settings of a configuration that says nothing about the estimator."""
     return msgspec.convert(with_kind_defaults({}), EstimatorSettings)
+
+
+def fade_per_tick(settings: EstimatorSettings, period_s: float) -> float:
+    """Factor that a held acceleration fades by in a tick of ``period_s``; 1 where it stays."""
+    return 1.0 if settings.held_accel_fade_s is None else math.exp(-period_s / settings.held_accel_fade_s)

@@ -41,6 +41,7 @@ class MeasurementWindow:
         other_accel_variance: float,
         reciprocal_ranges: Literal["independent", "shared"] = "independent",
         unknown_inputs: Literal["zero", "hold"] = "zero",
+        held_accel_fade: float = 1.0,
     ) -> None:
         self.layout = layout
         self.ticks = ticks
@@ -52,7 +53,8 @@ class MeasurementWindow:
         """Rows and inputs that no estimator could use."""
         self._shared = reciprocal_ranges == "shared"
         self._rows = empty_rows()
-        self._inputs = InputHistory(layout.size, other_accel_variance, hold=unknown_inputs == "hold")
+        hold = unknown_inputs == "hold"
+        self._inputs = InputHistory(layout.size, other_accel_variance, hold=hold, fade=held_accel_fade)
         self._origin: int | None = None
         self._last_heard = np.full(layout.size, np.iinfo(np.int64).min, np.int64)
 

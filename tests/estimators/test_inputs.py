@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.inputs import HISTORY_TICKS, InputHistory
+from estimators.settings import EstimatorSettings, fade_per_tick
 
 OTHER = 4.0 / 3.0
 NOISE = np.full(3, 0.01)
@@ -35,6 +36,26 @@ def test_an_unknown_input_is_held_with_a_variance_that_grows_with_its_age() -> N
     # THEN the last one is held, and its variance grows by the square of the ticks
     assert accel[:, 3] == pytest.approx([0.3] * 4)
     assert variance[:, 3] == pytest.approx([0.01, 0.02, 0.05, 0.10])
+
+
+def test_a_held_input_fades_and_its_variance_is_that_of_the_fading_guess() -> None:
+    # GIVEN an agent whose acceleration halves every tick, and one guess that knows so and one that does not
+    halving = {tick: 0.5**tick for tick in range(5)}
+    fading, staying = InputHistory(1, OTHER, hold=True, fade=0.5), InputHistory(1, OTHER, hold=True)
+    for tick, value in halving.items():
+        for made in (fading, staying):
+            made.insert(tick, 0, np.full(3, value), NOISE)
+    accel, variance = fading.table(4, 8)
+    # THEN the first is right, and as sure as its sensor
+    assert accel[:, 0] == pytest.approx([0.5**tick for tick in range(4, 8)])
+    assert variance[:, 0] == pytest.approx([0.01] * 4)
+    # and the other takes the changes for noise
+    assert staying.table(4, 8)[1][1, 0] > 0.05
+
+
+def test_the_fade_of_a_tick_follows_from_its_time_constant() -> None:
+    assert fade_per_tick(EstimatorSettings(), 0.1) == 1.0
+    assert fade_per_tick(EstimatorSettings(held_accel_fade_s=2.0), 0.1) == pytest.approx(np.exp(-0.05))
 
 
 def test_a_held_input_is_never_trusted_less_than_an_unknown_one() -> None:

@@ -3,14 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from sim_bridge.recording import Recording
 
 FU_ON_TIME, FU_LATE = 0.4, 0.3
 """Channel of Fu, Bi and Gao: on time, one tick late, else lost."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class DoubledRecording(Recording):
+    """A recording some of whose packets arrive a second time.
+
+    ``doubled`` ``(T+1, n, n)`` bool, as ``received``: a tick after its first copy there comes another one.
+    """
+
+    doubled: NDArray[np.bool_]
+
+
+def with_duplicates(recording: Recording, probability: float, rng: np.random.Generator) -> DoubledRecording:
+    """Every packet that arrives does so twice with ``probability``."""
+    given = {field.name: getattr(recording, field.name) for field in fields(Recording)}
+    return DoubledRecording(**given, doubled=rng.random(recording.received.shape) < probability)
 
 
 def with_loss(recording: Recording, probability: float, rng: np.random.Generator) -> Recording:
@@ -56,13 +73,21 @@ def with_fu_channel(recording: Recording, rng: np.random.Generator) -> Recording
     )
 
 
-def with_partition(recording: Recording, island: Sequence[int], first: int, last: int) -> Recording:
-    """No packet crosses between the slots of ``island`` and the others in ticks first..last-1."""
+def with_partition(
+    recording: Recording, island: Sequence[int], first: int, last: int, *, ranges: bool = False
+) -> Recording:
+    """No packet crosses between the slots of ``island`` and the others in ticks first..last-1.
+
+    With ``ranges`` no range is measured between them either (a hill instead of a jammed channel).
+    """
     inside = np.zeros(len(recording.agents), bool)
     inside[list(island)] = True
-    received = recording.received.copy()
-    received[first:last] &= inside[:, None] == inside[None, :]
-    return replace(recording, received=received)
+    same = inside[:, None] == inside[None, :]
+    received, measured = recording.received.copy(), recording.ranges.copy()
+    received[first:last] &= same
+    if ranges:
+        measured[first:last, ~same] = np.nan
+    return replace(recording, received=received, ranges=measured)
 
 
 def with_one_way(recording: Recording, receiver: int, sender: int) -> Recording:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.consistency import nees
-from estimators.estimator import Estimator, Payload
+from estimators.estimator import Estimate, Payload
 from estimators.factory import make_estimator
 from estimators.layout import STATES_PER_AGENT, Layout, block
 from estimators.measurements import (
@@ -109,12 +109,12 @@ def run_lockstep(
     ]
     links = Links(recording)
     relay = RecordRelay(recording, settings)
-    record = _Record(recording, centralised)
+    record = RunRecord(recording, centralised)
     for tick in range(recording.ticks + 1):
         arrivals = relay.exchange(tick)
         for slot, estimator in enumerate(fleet):
             if centralised:
-                estimator.begin(tick, *_everything(recording, tick))
+                estimator.begin(tick, *records_of(recording, [(tick, each) for each in range(layout.size)]))
             else:
                 estimator.begin(tick, *_received(recording, settings, arrivals[slot]))
         for round_ in range(fleet[0].rounds):
@@ -123,16 +123,18 @@ def run_lockstep(
                 received: dict[int, Payload] = {sender: sent[sender] for sender in links.heard(tick, slot)}
                 estimator.mix(round_, received)
         for slot, estimator in enumerate(fleet):
-            record.add(tick, slot, estimator)
+            record.add(tick, slot, estimator.solve())
         if progress is not None:
             progress(tick)
     return record.result([estimator.dropped for estimator in fleet])
 
 
-def _everything(recording: Recording, tick: int) -> tuple[RowTable, InputTable]:
-    slots = range(len(recording.agents))
-    rows = np.concatenate([own_rows(recording, tick, slot) for slot in slots])
-    return rows, np.concatenate([own_input(recording, tick, slot) for slot in slots])
+def records_of(recording: Recording, pairs: Iterable[tuple[int, int]]) -> tuple[RowTable, InputTable]:
+    """Rows and inputs of some (tick, slot)."""
+    found = list(pairs)
+    rows = [own_rows(recording, tick, slot) for tick, slot in found]
+    inputs = [own_input(recording, tick, slot) for tick, slot in found]
+    return np.concatenate([empty_rows(), *rows]), np.concatenate([empty_inputs(), *inputs])
 
 
 def _received(
@@ -145,7 +147,7 @@ def _received(
     return np.concatenate(rows), np.concatenate(inputs)
 
 
-class _Record:
+class RunRecord:
     """Collects the estimates of a run."""
 
     def __init__(self, recording: Recording, centralised: bool) -> None:
@@ -158,8 +160,8 @@ class _Record:
         self._iterations = np.zeros((ticks, n), np.int64)
         self._nees = np.full((2, ticks, n), np.nan)
 
-    def add(self, tick: int, slot: int, estimator: Estimator) -> None:
-        estimate = estimator.solve()
+    def add(self, tick: int, slot: int, estimate: Estimate) -> None:
+        """Put down an agent's estimate of a tick."""
         # a centralised estimate is everybody's
         where = slice(None) if self._centralised else slice(slot, slot + 1)
         self._mean[tick, where] = estimate.mean
@@ -175,6 +177,7 @@ class _Record:
             self._nees[1, tick, owner] = nees(error[own], estimate.covariance[own, own]) / STATES_PER_AGENT
 
     def result(self, dropped: list[int]) -> LockstepResult:
+        """All that was put down; ``dropped`` rows and inputs per agent."""
         known = self._truth is not None
         return LockstepResult(
             self._mean,

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.settings import EstimatorSettings
+from sim_bridge.link_conditions import DoubledRecording
 from sim_bridge.recording import Recording
 from transport.header import MAX_DATAGRAM_BODY_BYTES
 
@@ -41,11 +42,9 @@ class RecordRelay:
 
     def __init__(self, recording: Recording, settings: EstimatorSettings) -> None:
         self._n = len(recording.agents)
-        adjacent = np.zeros((self._n, self._n), bool)
-        for a, b in recording.edges.tolist():
-            adjacent[a, b] = adjacent[b, a] = True
-        self._reached = recording.received & adjacent
+        self._reached = recording.received & adjacency(recording)
         self._delay = recording.delay_ticks
+        self._doubled = recording.doubled if isinstance(recording, DoubledRecording) else None
         self._hops = settings.relay_hops
         self._exchanges = max(1, settings.rounds) if self._hops else 1
         self._memory = settings.window + 1 if self._hops else 1
@@ -53,17 +52,25 @@ class RecordRelay:
         self._known: list[dict[AgentTick, int]] = [{} for _ in range(self._n)]
         self._fresh: list[list[Arrival]] = [[] for _ in range(self._n)]
         self._under_way: dict[tuple[int, int], list[dict[AgentTick, int]]] = {}
+        self._copies: dict[tuple[int, int], list[dict[AgentTick, int]]] = {}
 
     def exchange(self, tick: int) -> list[list[Arrival]]:
-        """Run the exchanges of a tick; returns what is new to each agent, its own records included."""
+        """Run the exchanges of a tick; returns what is new to each agent, its own records included.
+
+        Records of a packet's second copy are handed out again: not to use them twice is the estimators' part.
+        """
         for slot in range(self._n):
             self._learn(slot, {(slot, tick): 0})
             for packet in self._under_way.pop((tick, slot), []):
                 self._learn(slot, packet)
+            for packet in self._copies.pop((tick, slot), []):
+                self._fresh[slot] += [Arrival(*record, hops) for record, hops in packet.items()]
         for _ in range(self._exchanges):
             packets = [self._packet(slot, tick) for slot in range(self._n)]
             for receiver, sender in np.argwhere(self._reached[tick]).tolist():
                 late = int(self._delay[tick, receiver, sender])
+                if self._doubled is not None and self._doubled[tick, receiver, sender]:
+                    self._copies.setdefault((tick + late + 1, receiver), []).append(packets[sender])
                 if late:
                     self._under_way.setdefault((tick + late, receiver), []).append(packets[sender])
                 else:
@@ -92,6 +99,14 @@ class RecordRelay:
                 break
             packet[whose, when] = hops + 1
         return packet
+
+
+def adjacency(recording: Recording) -> NDArray[np.bool_]:
+    """Who is whose neighbour, ``(n, n)``."""
+    adjacent = np.zeros((len(recording.agents),) * 2, bool)
+    for a, b in recording.edges.tolist():
+        adjacent[a, b] = adjacent[b, a] = True
+    return adjacent
 
 
 def _record_bytes(recording: Recording) -> NDArray[np.int64]:

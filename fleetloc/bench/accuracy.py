@@ -1,27 +1,20 @@
-"""Monte Carlo studies behind ``fleetloc bench table1``, ``accuracy`` and ``loss``."""
+"""Monte Carlo studies behind ``fleetloc bench table1`` and ``accuracy``."""
 
 from __future__ import annotations
 
-from functools import partial
+import dataclasses
+from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any
 
-import numpy as np
 from msgspec.structs import replace
 
 from estimators.settings import EstimatorSettings
+from fleetloc.bench.plots import curves, save
+from fleetloc.bench.sweep import Point, fly, numbered, show, steady_from
 from fleetloc.output import print_table, progress_bar, with_error
-from sim_bridge.link_conditions import with_delay, with_loss
-from sim_bridge.monte_carlo import Link, Sample, accuracy_row, run_study, table1_row
-from sim_bridge.recording import Recording
-from sim_bridge.study_scenario import Scenario
-
-RELAY = EstimatorSettings(
-    kind="dmhe_relay", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
-)
-"""The relay estimator as docs/algorithms.md recommends it (configs/relay.toml)."""
-
-STEADY_FROM = 41
-"""First sample that counts as steady (of 70)."""
+from sim_bridge.monte_carlo import Method, run_study, table1_row
+from sim_bridge.study_scenario import GRAPHS, Scenario, graph_of
 
 PAPER_TABLE1 = {
     "dekf_ci": (2.7651, 0.7059),
@@ -44,7 +37,8 @@ def table1(
         "dmhe_pre_ekf_2": replace(common, kind="dmhe_pre_ekf", rounds=2),
     }
     scenario = Scenario("line", samples, period_s, "paper" if start == "paper" else "good")
-    study = _run(scenario, methods, runs, seed)
+    with progress_bar("runs", runs * len(methods)) as advance:
+        study = run_study(scenario, methods, runs, seed, advance)
     rows = {name: table1_row(sample, samples) for name, sample in study.items()}
     print_table(
         ["method", "mean error", "final error", "step ms", "not converged", "fell back", "paper: mean", "final"],
@@ -74,96 +68,81 @@ def table1(
 
 
 def accuracy(
-    *, runs: int, seed: int, graph: str, samples: int, period_s: float, start: str, blind: int,
-    methods: dict[str, EstimatorSettings],
+    *, runs: int, seed: int, scenario: Scenario, methods: Mapping[str, Method], sweeps: Sequence[Point] = (),
+    jobs: int = 1, out: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
-    """Run methods on one scenario, print steady accuracy and consistency, return all figures."""
-    scenario = Scenario(graph, samples, period_s, "paper" if start == "paper" else "good", blind)
-    first = min(STEADY_FROM, samples)
-    study = _run(scenario, methods, runs, seed)
-    rows = {name: accuracy_row(sample, first, samples) for name, sample in study.items()}
+    """Run methods on one scenario and along axes, print accuracy and consistency, return all figures."""
+    base, *along = fly([Point("", "", None, scenario), *sweeps], methods, runs=runs, seed=seed, jobs=jobs)
+    first, last = steady_from(scenario.samples), scenario.samples
     print_table(
-        ["method", "steady", "all samples", "own position m", "own velocity m/s", "ANEES", "ANEES own", "failures"],
-        [
-            [
-                name,
-                with_error(row["norm_full_steady_mean"], row["norm_full_steady_mean_se"]),
-                with_error(row["norm_full_mean"], row["norm_full_mean_se"]),
-                with_error(row["own_position_steady_mean_m"], row["own_position_steady_mean_se_m"]),
-                with_error(row["own_velocity_steady_mean_mps"], row["own_velocity_steady_mean_se_mps"]),
-                with_error(row["anees_full_steady_mean"], row["anees_full_steady_mean_se"], 2),
-                with_error(row["anees_own_steady_mean"], row["anees_own_steady_mean_se"], 2),
-                str(row["failures"]),
-            ]
-            for name, row in rows.items()
-        ],
-        title=f"{graph}, {runs} runs, steady t = {first}..{samples} (mean ± standard error over runs)",
-    )
+        ["method", "steady", "transient", "all samples", "own position m", "own velocity m/s", "ANEES", "ANEES own",
+         "failures"],
+        [_line(name, row) for name, row in base.rows.items()],
+        title=f"{scenario.graph}, {runs} runs, steady t = {first}..{last} (mean ± standard error over runs)",
+    )  # fmt: skip
+    axes = list(dict.fromkeys(each.point.axis for each in along))
+    for axis in axes:
+        some = [each for each in along if each.point.axis == axis]
+        show(some, f"{AXES[axis]}, {runs} runs")
+        if out is not None and len(numbered(some, axis)) > 1:
+            save(curves(numbered(some, axis), AXES[axis]), out, axis)
     settings = {
         "runs": runs,
         "seed": seed,
-        "graph": graph,
-        "samples": samples,
-        "period_s": period_s,
-        "start": start,
-        "blind": blind,
+        "graph": scenario.graph,
+        "samples": scenario.samples,
+        "period_s": scenario.period_s,
+        "start": scenario.start,
+        "blind": scenario.blind,
         "steady_from": first,
     }
-    return {"settings": settings, "rows": rows}
+    return {"settings": settings, "rows": base.rows, "points": [each.document() for each in along]}
 
 
-def default_methods(other_accel_variance: float) -> dict[str, EstimatorSettings]:
-    """The estimators that every accuracy study compares."""
-    q = other_accel_variance
-    return {
-        "dmhe_pre_ekf": EstimatorSettings(kind="dmhe_pre_ekf", other_accel_variance=q),
-        "dmhe": EstimatorSettings(kind="dmhe", other_accel_variance=q),
-        "dekf_ci": EstimatorSettings(kind="dekf_ci", other_accel_variance=q),
-        "dekf_ci_shared": EstimatorSettings(kind="dekf_ci", share_inputs="neighbours", other_accel_variance=q),
-        "dmhe_pre_ekf_shared": EstimatorSettings(share_inputs="neighbours", other_accel_variance=q),
-        "dmhe_relay": RELAY,
-        "centralized_iekf": EstimatorSettings(kind="centralized_ekf", iterations_ekf=20),
-    }
+AXES = {
+    "agents": "number of drones",
+    "gps_share": "share of drones with GPS",
+    "start_offset_m": "error of the start, m",
+}
+"""What an accuracy study can be repeated along, in words."""
 
 
-def _run(
-    scenario: Scenario, methods: dict[str, EstimatorSettings], runs: int, seed: int
-) -> dict[str, Sample]:
-    with progress_bar("runs", runs * len(methods)) as advance:
-        return run_study(scenario, methods, runs, seed, advance)
+def sweep_points(
+    scenario: Scenario, family: str, agents: Sequence[int], gps_shares: Sequence[float], offsets_m: Sequence[float]
+) -> list[Point]:
+    """Fleets of other sizes, other shares of GPS, other errors of the start; all else as in ``scenario``.
+
+    Raises ``ValueError`` for a size that the family does not have.
+    """
+    n = GRAPHS[scenario.graph][0]
+    found = []
+    for size in agents:
+        graph = graph_of(family, size)
+        found.append(Point(graph, "agents", size, dataclasses.replace(scenario, graph=graph, blind=0)))
+    for share in gps_shares:
+        blind = n - round(share * n)
+        name = f"{scenario.graph}, {n - blind} of {n} with GPS"
+        found.append(Point(name, "gps_share", share, dataclasses.replace(scenario, blind=blind), None, blind == 0))
+    for offset_m in offsets_m:
+        moved = dataclasses.replace(scenario, start_offset_m=offset_m)
+        found.append(Point(f"start {offset_m:g} m off", "start_offset_m", offset_m, moved, None, offset_m == 0))
+    return found
 
 
-def loss(
-    *, runs: int, seed: int, losses: list[float], delays_ticks: list[int], methods: dict[str, EstimatorSettings]
-) -> dict[str, Any]:
-    """Methods under Bernoulli loss and under constant delay on every link of the line of three."""
-    scenario = Scenario()
-    first, last = STEADY_FROM, scenario.samples
-    conditions: dict[str, Link] = {f"loss {p:g}": partial(_lossy, probability=p) for p in losses}
-    conditions |= {f"delay {ticks} ticks": partial(_late, ticks=ticks) for ticks in delays_ticks}
-    rows: dict[str, dict[str, Any]] = {}
-    with progress_bar("runs", runs * len(methods) * len(conditions)) as advance:
-        for name, link in conditions.items():
-            study = run_study(scenario, methods, runs, seed, advance, link)
-            rows[name] = {method: accuracy_row(sample, first, last) for method, sample in study.items()}
-    print_table(
-        ["links", *(f"{method}: error" for method in methods), *(f"{method}: ANEES" for method in methods)],
-        [
-            [
-                name,
-                *(with_error(row["norm_full_steady_mean"], row["norm_full_steady_mean_se"]) for row in each.values()),
-                *(f"{row['anees_full_steady_mean']:.2f}" for row in each.values()),
-            ]
-            for name, each in rows.items()
-        ],
-        title=f"line, {runs} runs, steady t = {first}..{last}",
-    )
-    return {"settings": {"runs": runs, "seed": seed, "steady_from": first}, "rows": rows}
+def _line(name: str, row: Mapping[str, float | int]) -> list[str]:
+    def cell(key: str, unit: str = "", digits: int = 3) -> str:
+        if f"{key}{unit}" not in row:  # a flight too short to have a transient
+            return "-"
+        return with_error(row[f"{key}{unit}"], row[f"{key}_se{unit}"], digits)
 
-
-def _lossy(recording: Recording, rng: np.random.Generator, *, probability: float) -> Recording:
-    return with_loss(recording, probability, rng)
-
-
-def _late(recording: Recording, _rng: np.random.Generator, *, ticks: int) -> Recording:
-    return with_delay(recording, ticks)
+    return [
+        name,
+        cell("norm_full_steady_mean"),
+        cell("norm_full_transient_mean"),
+        cell("norm_full_mean"),
+        cell("own_position_steady_mean", "_m"),
+        cell("own_velocity_steady_mean", "_mps"),
+        cell("anees_full_steady_mean", digits=2),
+        cell("anees_own_steady_mean", digits=2),
+        str(row["failures"]),
+    ]

@@ -5,17 +5,22 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimators.settings import EstimatorSettings
 from sim_bridge.link_conditions import (
     with_bursts,
     with_delay,
+    with_duplicates,
     with_fu_channel,
     with_loss,
     with_one_way,
     with_partition,
 )
+from sim_bridge.lockstep import run_lockstep
+from sim_bridge.relay import RecordRelay
 from sim_bridge.study_scenario import Scenario
 
 RECORDING = Scenario("K5", samples=2000).record(0, 0)
+SETTINGS = EstimatorSettings(kind="dmhe_relay", window=4, rounds=2, share_inputs="fleet", relay_hops=2)
 SIGMA = 4.0 / np.sqrt(RECORDING.received.size)
 """Four standard deviations of a share of all packets, at most."""
 
@@ -63,3 +68,29 @@ def test_a_one_way_link() -> None:
     one_way = with_one_way(RECORDING, 0, 1).received
     assert not one_way[:, 0, 1].any()
     assert one_way[:, 1, 0].all()
+
+
+def test_duplicates_have_their_share_and_are_not_used_twice() -> None:
+    doubled = with_duplicates(RECORDING, 0.4, np.random.default_rng(8))
+    assert doubled.doubled.mean() == pytest.approx(0.4, abs=SIGMA)
+    # GIVEN the same flight over links that lose, with and without second copies
+    lossy = with_loss(Scenario(samples=14).record(0, 0), 0.3, np.random.default_rng(1))
+    twice = with_duplicates(lossy, 0.6, np.random.default_rng(2))
+    relay = RecordRelay(twice, SETTINGS)
+    arrived = [(each.slot, each.tick) for tick in range(15) for each in relay.exchange(tick)[1]]
+    assert len(arrived) > len(set(arrived))  # they do reach the estimator
+    # THEN the estimates are the same, bit by bit
+    for settings in (SETTINGS, EstimatorSettings()):
+        one, other = run_lockstep(lossy, settings), run_lockstep(twice, settings)
+        np.testing.assert_array_equal(one.mean, other.mean)
+        np.testing.assert_array_equal(one.cov_diag, other.cov_diag)
+
+
+def test_a_partition_may_cut_ranges_too() -> None:
+    parted = with_partition(RECORDING, (0, 1), 5, 9, ranges=True)
+    assert np.isnan(parted.ranges[5:9, 0, 2]).all()
+    assert np.isnan(parted.ranges[5:9, 4, 1]).all()
+    for ticks, pair in ((slice(5, 9), (0, 1)), (slice(5, 9), (3, 2)), (slice(9, 12), (0, 2))):
+        np.testing.assert_array_equal(parted.ranges[ticks, *pair], RECORDING.ranges[ticks, *pair])
+    kept = with_partition(RECORDING, (0, 1), 5, 9)
+    np.testing.assert_array_equal(kept.ranges, RECORDING.ranges)

@@ -11,16 +11,19 @@ from estimators.consistency import average_nees_band, nees, nis, rms
 from estimators.settings import EstimatorSettings
 from sim_bridge.lockstep import LockstepResult
 from sim_bridge.monte_carlo import (
+    Flight,
+    Hangar,
     Sample,
     accuracy_row,
     mean_and_error,
+    ratio_of_means,
     run_study,
     table1_row,
     window_mean,
     window_rms,
 )
 from sim_bridge.recording import recording_from_arrays
-from sim_bridge.study_scenario import GRAPHS, Scenario
+from sim_bridge.study_scenario import GRAPHS, Scenario, graph_of
 from tests.support.builders import recording_arrays
 
 # --- scenario ---------------------------------------------------------------------------------------------------
@@ -113,6 +116,53 @@ def test_unknown_graph() -> None:
         Scenario(graph="moebius")
 
 
+def test_families_of_graphs() -> None:
+    assert [graph_of(family, 3) for family in ("line", "ring", "K")] == ["line", "triangle", "triangle"]
+    for family, edges in (("line", 6), ("ring", 7), ("K", 21)):
+        agents, found = GRAPHS[graph_of(family, 7)]
+        assert (agents, len(found)) == (7, edges)
+    for family, agents in (("star", 5), ("ring", 2), ("ring", 11)):
+        with pytest.raises(ValueError, match=r"expected one of line, ring, K with 3 to 10 agents"):
+            graph_of(family, agents)
+
+
+def test_an_offset_start_is_off_and_its_covariance_says_so() -> None:
+    # GIVEN starts with hardly any spread but 10 m off
+    squares = []
+    for run in range(40):
+        made = Scenario(samples=1, start_sigma_m=1e-6, start_offset_m=10.0).record(3, run)
+        assert made.truth is not None
+        error = (made.x0 - made.truth[0].ravel()).reshape(3, 3, 6)
+        # THEN every position of every agent is, each its own way, and no velocity more than before
+        np.testing.assert_allclose(np.linalg.norm(error[:, :, :3], axis=-1), 10.0, rtol=1e-5)
+        squares.append(np.square(error))
+        np.testing.assert_allclose(np.diag(made.P0)[:3], 100.0 / 3.0)
+    mean = np.mean(squares, axis=(0, 1, 2))
+    np.testing.assert_allclose(mean[:3], 100.0 / 3.0, rtol=0.15)
+    np.testing.assert_allclose(mean[3:], 1.0, rtol=0.2)
+    with pytest.raises(ValueError, match="expected the good start"):
+        Scenario(start="paper", start_offset_m=1.0)
+
+
+def test_a_start_of_another_spread() -> None:
+    errors = []
+    for run in range(40):
+        made = Scenario(samples=1, start_sigma_m=0.3).record(0, run)
+        assert made.truth is not None
+        errors.append((made.x0 - made.truth[0].ravel()).reshape(-1, 6))
+    assert np.std(np.concatenate(errors)[:, :3]) == pytest.approx(0.3, rel=0.1)
+    np.testing.assert_allclose(np.diag(made.P0)[:6], [0.09] * 3 + [1.0] * 3)
+
+
+def test_vehicles_that_move_on_fly_to_the_next_ones_reference() -> None:
+    made = Scenario(graph="triangle", samples=240, turn_every_s=12.0).record(0, 0)
+    assert made.truth is not None
+    first = Scenario(graph="triangle", samples=120).record(0, 0).truth
+    assert first is not None
+    np.testing.assert_array_equal(made.truth[:121], first)
+    np.testing.assert_allclose(made.truth[-1, :, :3], [[0, 5, 6], [-5, 0, 7], [5, 0, 5]], atol=0.15)
+
+
 # --- figures, by hand -------------------------------------------------------------------------------------------
 
 
@@ -160,6 +210,38 @@ def test_means_and_their_errors_by_hand() -> None:
     assert error == pytest.approx(5.5 / (2 * np.sqrt(10.5)))
 
 
+def test_ratio_of_two_methods_on_the_same_runs_by_hand() -> None:
+    # GIVEN two runs; the first method is worse by a factor of 2 in one, 4 in the other
+    over = [np.array([[9.0], [2.0]]), np.array([[9.0], [12.0]])]
+    under = [np.array([[9.0], [1.0]]), np.array([[9.0], [3.0]])]
+    ratio, error = ratio_of_means(over, under, 1, 1)
+    assert ratio == pytest.approx(14 / 4)
+    # per run a - ratio b = -1.5 and 1.5, over the mean 2; standard error of two
+    assert error == pytest.approx(0.75 * np.sqrt(2) / np.sqrt(2))
+    # and a method beside itself is 1, without error
+    assert ratio_of_means(under, under, 0, 1) == (1.0, 0.0)
+
+
+def test_several_processes_give_what_one_gives() -> None:
+    methods = {"central": EstimatorSettings(kind="centralized_ekf")}
+    alone = run_study(Scenario(samples=6), methods, 3, seed=2)
+    with Hangar(2) as hangar:
+        together = run_study(Scenario(samples=6), methods, 3, seed=2, hangar=hangar)
+    for name in ("norm_full", "own_sigma", "nees_full", "status"):
+        for one, other in zip(getattr(alone["central"], name), getattr(together["central"], name), strict=True):
+            np.testing.assert_array_equal(one, other)
+
+
+def test_links_have_a_seed_of_their_own() -> None:
+    def noted(recording, rng):  # type: ignore[no-untyped-def]
+        return replace(recording, x0=recording.x0 * 0.0 + rng.random())
+
+    def drawn(seed: int, link_seed: int | None) -> float:
+        return float(Flight(Scenario(samples=1), {}, seed, 0, noted, link_seed).record().x0[0, 0])
+
+    assert drawn(1, None) == drawn(1, 1) == drawn(2, 1) != drawn(2, None)
+
+
 def test_rows_of_the_tables_by_hand() -> None:
     sample = Sample(
         norm_full=[np.array([[9.0], [1.0], [3.0]]), np.array([[9.0], [3.0], [5.0]])],
@@ -189,6 +271,9 @@ def test_rows_of_the_tables_by_hand() -> None:
     assert steady["others_position_steady_mean_m"] == 3.0
     assert steady["anees_full_steady_mean"] == pytest.approx(0.9)
     assert steady["failures"] == 3
+    # the transient is what comes before: t = 1
+    assert steady["norm_full_transient_mean"] == 2.0
+    assert steady["anees_full_transient_mean"] == pytest.approx(0.9)
 
 
 # --- consistency ------------------------------------------------------------------------------------------------

@@ -104,14 +104,14 @@ class _Link:
 
     def __init__(self, neighbour: int, faults: LinkFaults, rng: np.random.Generator) -> None:
         self._neighbour = neighbour
-        self._faults = faults
+        self.faults = faults
         self._rng = rng
         self._bad = False
         self._last_due = -math.inf
 
     def arrivals(self, now: float) -> tuple[float, ...]:
         """When a packet received at ``now`` is delivered: never, once, or twice."""
-        f = self._faults
+        f = self.faults
         burst, loss, held, twice, *spread = self._rng.random(_DRAWS).tolist()
         self._bad = burst >= f.burst_end if self._bad else burst < f.burst_start
         lost = loss < (f.burst_loss if self._bad else f.loss)
@@ -125,7 +125,7 @@ class _Link:
         return first, max(first, now + self._delay(*spread[2:]))
 
     def _delay(self, first: float, second: float) -> float:
-        f = self._faults
+        f = self.faults
         return f.delay_s - f.delay_exponential_s * math.log1p(-first) + f.delay_uniform_s * second
 
 
@@ -148,6 +148,11 @@ class Channel(Generic[Item]):
         links = {neighbour: settings.faults_of(neighbour) for neighbour in ids}
         rngs = {neighbour: np.random.default_rng([seed, receiver, neighbour]) for neighbour in ids}
         return cls(links, rngs)
+
+    def change(self, settings: ChannelSettings) -> None:
+        """Other faults from now on; what is under way and the links' generators go on as they are."""
+        for neighbour, link in self._links.items():
+            link.faults = settings.faults_of(neighbour)
 
     def offer(self, neighbour: int, item: Item, now: float) -> None:
         """A packet from a neighbour was received at ``now``; one from elsewhere passes without faults."""

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import os
 import re
-import stat
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from nacl.signing import SigningKey, VerifyKey
 
 from transport.auth import fingerprint, public_hex
 from transport.errors import KeyFileError
+from transport.key_files import check_directory, read_lines, read_text, write_text
 from transport.streams import check_agent_id
 
 _SECRET_TAG = "fleetloc-ed25519-secret-1"
@@ -65,7 +65,7 @@ def init_keys(directory: Path, agent_ids: Iterable[int]) -> list[KeyInfo]:
 
 def add_key(directory: Path, agent_id: int) -> KeyInfo:
     """Make a key pair for one more agent; raises `KeyFileError` if it has one already."""
-    _check_directory(directory)
+    check_directory(directory)
     _refuse_existing(directory, agent_id)
     signing = SigningKey.generate()
     _write_pair(directory, agent_id, signing, (signing.verify_key,))
@@ -83,13 +83,13 @@ def rotate_key(directory: Path, agent_id: int) -> KeyInfo:
 def retire_key(directory: Path, agent_id: int) -> KeyInfo:
     """Stop accepting an agent's key from before its last rotation."""
     newest = load_public_keys(directory, agent_id)[0]
-    _write(public_path(directory, agent_id), f"{_PUBLIC_TAG} {public_hex(newest)}\n", 0o644)
+    write_text(public_path(directory, agent_id), f"{_PUBLIC_TAG} {public_hex(newest)}\n", 0o644)
     return _info(directory, agent_id)
 
 
 def list_keys(directory: Path) -> list[KeyInfo]:
     """All agents with a public key in the directory, by id."""
-    _check_directory(directory)
+    check_directory(directory)
     try:
         names = [_PUBLIC_NAME.fullmatch(name) for name in os.listdir(directory)]
     except OSError as error:
@@ -99,9 +99,9 @@ def list_keys(directory: Path) -> list[KeyInfo]:
 
 def load_secret(directory: Path, agent_id: int) -> SigningKey:
     """An agent's signing key; raises `KeyFileError` if it is missing, malformed or not private."""
-    _check_directory(directory)
+    check_directory(directory)
     path = secret_path(directory, agent_id)
-    lines = _read_lines(path, forbidden=0o077, remedy=f"chmod 600 {path}")
+    lines = read_lines(path, forbidden=0o077, remedy=f"chmod 600 {path}")
     if len(lines) != 1:
         raise KeyFileError(f"{path}: {len(lines)} lines, expected 1 with a secret key")
     return SigningKey(_key_bytes(path, lines[0], _SECRET_TAG))
@@ -109,9 +109,9 @@ def load_secret(directory: Path, agent_id: int) -> SigningKey:
 
 def load_public_keys(directory: Path, agent_id: int) -> tuple[VerifyKey, ...]:
     """An agent's public keys, newest first; raises `KeyFileError`."""
-    _check_directory(directory)
+    check_directory(directory)
     path = public_path(directory, agent_id)
-    lines = _read_lines(path, forbidden=0o022, remedy=f"chmod 644 {path}")
+    lines = read_lines(path, forbidden=0o022, remedy=f"chmod 644 {path}")
     if not 1 <= len(lines) <= MAX_PUBLIC_KEYS:
         raise KeyFileError(f"{path}: {len(lines)} lines, expected 1 to {MAX_PUBLIC_KEYS} public keys")
     return tuple(VerifyKey(_key_bytes(path, line, _PUBLIC_TAG)) for line in lines)
@@ -130,7 +130,7 @@ def next_boot(path: Path, unix_s: float) -> int:
     """
     last = 0
     if os.path.exists(path):
-        text = _read_text(path).strip()
+        text = read_text(path).strip()
         if not text.isascii() or not text.isdigit() or int(text) > MAX_BOOT:
             found = text[:20]
             raise KeyFileError(f"{path}: {found!r}, expected the number of the last start; remove the file")
@@ -138,11 +138,11 @@ def next_boot(path: Path, unix_s: float) -> int:
     boot = max(last + 1, int(unix_s))
     if boot > MAX_BOOT:
         raise KeyFileError(f"{path}: start numbers are used up at {last}; make new keys and remove the file")
-    _write(path, f"{boot}\n", 0o600)
+    write_text(path, f"{boot}\n", 0o600)
     return boot
 
 
-# --- files: asked for with `os.path`, which answers "no" where `Path` raises for what we may not see ---------
+# --- common -------------------------------------------------------------------------------------------------
 
 
 def _refuse_existing(directory: Path, agent_id: int) -> None:
@@ -161,55 +161,8 @@ def _write_pair(
 ) -> None:
     # the public file first: were we stopped in between, the old secret still has its public key
     lines = "".join(f"{_PUBLIC_TAG} {public_hex(key)}\n" for key in public_keys)
-    _write(public_path(directory, agent_id), lines, 0o644)
-    _write(secret_path(directory, agent_id), f"{_SECRET_TAG} {signing.encode().hex()}\n", 0o600)
-
-
-def _write(path: Path, text: str, mode: int) -> None:
-    """Replace a file as a whole, with its mode from the first moment on."""
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    try:
-        temporary.unlink(missing_ok=True)
-        descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, mode)
-        with os.fdopen(descriptor, "w", encoding="ascii") as file:
-            os.fchmod(descriptor, mode)
-            file.write(text)
-            file.flush()
-            os.fsync(descriptor)
-        os.replace(temporary, path)
-    except OSError as error:
-        raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
-
-
-def _check_directory(directory: Path) -> None:
-    if not os.path.isdir(directory):
-        raise KeyFileError(f"{directory}: no such key directory; make one with `fleetloc keys init`")
-    _check_mode(directory, forbidden=0o022, remedy=f"chmod 700 {directory}")
-
-
-def _check_mode(path: Path, *, forbidden: int, remedy: str) -> None:
-    status = path.stat()
-    if status.st_uid not in (os.geteuid(), 0):
-        raise KeyFileError(f"{path}: belongs to user {status.st_uid}, expected {os.geteuid()} or root")
-    if status.st_mode & forbidden:
-        mode = stat.S_IMODE(status.st_mode)
-        raise KeyFileError(f"{path}: mode {mode:04o} lets others at it; do `{remedy}`")
-
-
-def _read_lines(path: Path, *, forbidden: int, remedy: str) -> list[str]:
-    if not os.path.isfile(path):
-        raise KeyFileError(f"{path}: no such key file; make it with `fleetloc keys add` or copy it here")
-    _check_mode(path, forbidden=forbidden, remedy=remedy)
-    return _read_text(path).splitlines()
-
-
-def _read_text(path: Path) -> str:
-    try:
-        return path.read_text(encoding="ascii")
-    except UnicodeDecodeError:
-        raise KeyFileError(f"{path}: not a text file") from None
-    except OSError as error:
-        raise KeyFileError(f"{path}: cannot be read: {error.strerror}") from None
+    write_text(public_path(directory, agent_id), lines, 0o644)
+    write_text(secret_path(directory, agent_id), f"{_SECRET_TAG} {signing.encode().hex()}\n", 0o600)
 
 
 def _key_bytes(path: Path, line: str, tag: str) -> bytes:

@@ -19,7 +19,14 @@ import zenoh
 
 from transport.errors import SessionError
 from transport.session_settings import SessionSettings, zenoh_config
-from transport.streams import Stream, check_agent_id, key_expression, parse_key, presence_pattern
+from transport.streams import (
+    Stream,
+    check_agent_id,
+    key_expression,
+    parse_key,
+    presence_pattern,
+    self_contained,
+)
 
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
 """Zenoh's errors name places in its own source, which help nobody here."""
@@ -71,7 +78,14 @@ class Session:
     """
 
     def __init__(
-        self, session: zenoh.Session, fleet: str, agent_id: int | None, handlers: Handlers, inbox_packets: int
+        self,
+        session: zenoh.Session,
+        fleet: str,
+        agent_id: int | None,
+        handlers: Handlers,
+        inbox_packets: int,
+        *,
+        over_datagrams: bool = False,
     ) -> None:
         self._session = session
         self._fleet = fleet
@@ -80,21 +94,41 @@ class Session:
         self._loop = asyncio.get_running_loop()
         self._inbox: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         self._inbox_packets = inbox_packets
+        self._over_datagrams = over_datagrams
         self._lock = threading.Lock()
         self._draining = False
         self._closed = False
         self._publishers: dict[str, zenoh.Publisher] = {}
         self._declared: list[Any] = []
+        self._subscribers: dict[tuple[int, Stream], Any] = {}
         self.shed = 0
         self.failed = 0
 
     def subscribe(self, agent_id: int, streams: Iterable[Stream]) -> None:
         """Listen to streams of one agent: its exact keys, so that the topology is what was configured."""
         for stream in streams:
-            key = key_expression(self._fleet, agent_id, stream)
-            handler = zenoh.handlers.Callback(self._on_sample, indirect=False)
-            origin = zenoh.Locality.REMOTE
-            self._declared.append(self._session.declare_subscriber(key, handler, allowed_origin=origin))
+            self._subscribers[agent_id, stream] = self._subscriber(agent_id, stream)
+
+    def resubscribe(self, agent_id: int) -> None:
+        """Declare the subscriptions to an agent anew, for the case that the declarations were lost on the way.
+
+        Datagram links lose them silently. For a moment nothing is subscribed to: do it for silent agents only.
+        """
+        if self._closed:
+            return
+        for subject, subscriber in self._subscribers.items():
+            if subject[0] == agent_id:
+                try:
+                    subscriber.undeclare()
+                    self._subscribers[subject] = self._subscriber(*subject)
+                except zenoh.ZError:
+                    self.failed += 1
+
+    def _subscriber(self, agent_id: int, stream: Stream) -> Any:
+        key = key_expression(self._fleet, agent_id, stream)
+        key = self_contained(key) if self._over_datagrams else key
+        handler = zenoh.handlers.Callback(self._on_sample, indirect=False)
+        return self._session.declare_subscriber(key, handler, allowed_origin=zenoh.Locality.REMOTE)
 
     def announce(self) -> None:
         """Show that this agent is there, answer clock questions, and watch who else is there.
@@ -180,7 +214,7 @@ class Session:
 
     def _close(self) -> None:
         try:
-            for declared in reversed(self._declared):
+            for declared in (*self._subscribers.values(), *reversed(self._declared)):
                 declared.undeclare()
         finally:
             self._session.close()  # type: ignore[no-untyped-call]
@@ -286,4 +320,5 @@ async def open_session(
         raise SessionError(
             f"Zenoh session listening on {where}: {cause}; is the port taken, or the address not ours?"
         ) from None
-    return Session(session, fleet, agent_id, handlers, settings.inbox_packets)
+    datagrams = any(endpoint.startswith("udp/") for endpoint in (*settings.listen, *settings.connect))
+    return Session(session, fleet, agent_id, handlers, settings.inbox_packets, over_datagrams=datagrams)

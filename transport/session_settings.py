@@ -15,7 +15,15 @@ import zenoh
 
 from transport.errors import SettingsError
 from transport.header import MAX_PACKET_BYTES
-from transport.streams import PREFIX, Stream, check_agent_id, check_fleet_name, key_expression
+from transport.streams import (
+    PREFIX,
+    Stream,
+    agent_name,
+    check_agent_id,
+    check_fleet_name,
+    key_expression,
+    observer_name,
+)
 
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=600_000)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
@@ -45,9 +53,10 @@ class SessionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """
 
     listen: tuple[str, ...] = ()
-    """Endpoints such as ``tcp/192.168.7.3:7447``. For lossy radios two of them: ``tcp/...?rel=1`` with
-    ``udp/...?rel=0``, so that round packets take the datagrams and declarations the stream; or one UDP
-    multicast group, ``udp/224.0.0.225:7447#iface=wlan0``. QUIC collapses under loss with delay."""
+    """Endpoints such as ``tcp/192.168.7.3:7447``; for lossy radios ``udp/...``, or both at once, ``tcp/...?rel=1``
+    and ``udp/...?rel=0``, so that round packets take the datagrams and declarations the stream. QUIC collapses under
+    loss with delay; over a multicast group peers may answer each other's declarations without end (docs/links.md).
+    """
 
     connect: tuple[str, ...] = ()
     """Endpoints of the neighbours to dial (those with lower ids)."""
@@ -190,8 +199,8 @@ def _tls_table(tls: TlsSettings) -> dict[str, Any]:
 def access_control(fleet: str, agent_id: int | None, members: Iterable[int]) -> dict[str, Any]:
     """Zenoh access control of one agent: each member may put on its own keys only, everything else is denied.
 
-    A UWB driver on the drone comes with the drone's own certificate and may put on its ``uwb`` key. Without
-    ``agent_id`` the table is an observer's, who only listens.
+    A UWB driver on the drone comes with the drone's own certificate and may put on its ``uwb`` key. Who comes with
+    the observer's certificate hears everything and may put nothing. Without ``agent_id`` the table is an observer's.
     """
 
     def keys(member: int) -> str:
@@ -216,9 +225,11 @@ def access_control(fleet: str, agent_id: int | None, members: Iterable[int]) -> 
         else:
             rule = _rule(f"from_{member:03d}", ["ingress"], tells, keys(member))
         rules.append(rule)
-        name = f"{fleet}.agent.{member:03d}"
-        subjects.append({"id": f"member_{member:03d}", "cert_common_names": [name]})
+        subjects.append({"id": f"member_{member:03d}", "cert_common_names": [agent_name(fleet, member)]})
         policies.append({"rules": [*common, f"from_{member:03d}"], "subjects": [f"member_{member:03d}"]})
+    if agent_id is not None:
+        subjects.append({"id": "observers", "cert_common_names": [observer_name(fleet)]})
+        policies.append({"rules": ["subscribe", "own_out"], "subjects": ["observers"]})
     return {
         "enabled": True,  # without it Zenoh ignores the whole table silently
         "default_permission": "deny",

@@ -52,9 +52,29 @@ def check_agent_id(agent_id: int) -> int:
     return agent_id
 
 
+def agent_name(fleet: str, agent_id: int) -> str:
+    """Common name of an agent's certificate, which access control goes by."""
+    return f"{check_fleet_name(fleet)}.agent.{check_agent_id(agent_id):03d}"
+
+
+def observer_name(fleet: str) -> str:
+    """Common name of the certificate of those who only listen."""
+    return f"{check_fleet_name(fleet)}.observer"
+
+
 def key_expression(fleet: str, agent_id: int, stream: Stream) -> str:
     """Key of one stream of one agent; raises `SettingsError` for a bad fleet name or id."""
     return f"{PREFIX}/{check_fleet_name(fleet)}/agent/{check_agent_id(agent_id):03d}/{stream.value}"
+
+
+def self_contained(key: str) -> str:
+    """A key expression that matches the key, and that Zenoh declares in one message.
+
+    A literal key it declares in two: once per link a number for the key, then the subscription by that number. If a
+    datagram link loses the first, all that follows on that key is thrown away there. Keys that begin with a wildcard
+    go without a number.
+    """
+    return "*" + key.removeprefix(PREFIX.partition("/")[0])
 
 
 def presence_pattern(fleet: str) -> str:

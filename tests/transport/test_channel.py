@@ -161,6 +161,24 @@ def test_the_two_directions_and_the_neighbours_lose_different_packets() -> None:
     assert len({tuple(heard(*link)) for link in ((1, 2), (2, 1), (1, 3), (3, 2))}) == 4
 
 
+def test_changed_faults_leave_what_is_under_way_and_the_draws_alone() -> None:
+    # GIVEN two links of one seed, one of which is told of an outage half way
+    faults = ChannelSettings(loss=0.3, delay_s=0.05)
+    silent = msgspec.structs.replace(faults, outages=(Outage(5.0, 7.0),))
+    plain: Channel[int] = Channel.seeded(faults, seed=3, receiver=1, neighbours=[2])
+    changed: Channel[int] = Channel.seeded(faults, seed=3, receiver=1, neighbours=[2])
+    for number in range(1000):
+        now = number * 0.01
+        if number == 500:
+            changed.change(silent)
+        plain.offer(2, number, now)
+        changed.offer(2, number, now)
+    # THEN both have the same fate but for the outage
+    heard = {number for _, number in plain.due(99.0)}
+    assert {number for _, number in changed.due(99.0)} == {n for n in heard if not 500 <= n < 700}
+    assert plain.lost[2] < changed.lost[2]
+
+
 @pytest.mark.parametrize(
     "table",
     [

@@ -15,6 +15,7 @@ from agent.config_tables import FleetConfig
 from agent.frames import FleetFrame
 from agent.mavlink_codec import Decoder, Encoder, Message, mavlink
 from agent.mavlink_samples import SampleAdapter
+from agent.mavlink_signing import LinkSigning
 from agent.samples import Sample
 from agent.stream_rates import StreamRates
 from agent.timesync import BootClock
@@ -52,15 +53,22 @@ class AutopilotId:
 
 
 class AutopilotSession:
-    """One autopilot on one link; ``ignored`` counts messages not acted on, by reason."""
+    """One autopilot on one link; ``ignored`` counts messages not acted on, by reason.
 
-    def __init__(self, config: FleetConfig, agent_id: int, *, datagrams: bool) -> None:
+    With ``signing`` we sign what we send, and what is not well signed counts as not received.
+    """
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, *, datagrams: bool, signing: LinkSigning | None = None
+    ) -> None:
         table = config.agent(agent_id)
         self._settings = config.mavlink
         self._expected_system = config.system_id(agent_id)
         self._expected_flavour = table.autopilot
-        self.decoder = Decoder(datagrams=datagrams)
-        self._encoder = Encoder(self._expected_system, config.mavlink.component_id)
+        self.signing = signing
+        self._epoch_unix_s = config.fleet.epoch_unix_s
+        self.decoder = Decoder(datagrams=datagrams, signing=signing)
+        self._encoder = Encoder(self._expected_system, config.mavlink.component_id, signing)
         self.clock = BootClock(config.mavlink.max_rtt_s)
         self.samples = SampleAdapter(
             FleetFrame.of(config), config.sensors, config.fleet.epoch_unix_s, self._fleet_time_of_boot
@@ -90,6 +98,7 @@ class AutopilotSession:
     def receive(self, data: bytes, now_s: float) -> list[Sample]:
         """Take in bytes of the link; the samples they hold. Answers are fetched by `to_send`."""
         samples = []
+        self._tell_time(now_s)
         for message in self.decoder.feed(data):
             self.heard += message.get_srcSystem() == self._expected_system
             sample = self._on_message(message, now_s)
@@ -99,6 +108,7 @@ class AutopilotSession:
 
     def to_send(self, now_s: float) -> list[bytes]:
         """Frames due now: answers, our heartbeat, TIMESYNC and rate requests; notes a lost autopilot."""
+        self._tell_time(now_s)
         frames, self._answers = self._answers, []
         if now_s >= self._next_heartbeat_s and self.system_status is not None:
             due_s = self._next_heartbeat_s or now_s
@@ -117,6 +127,10 @@ class AutopilotSession:
             if request is not None:
                 frames.append(self._encoder.encode(self._interval_command(*request)))
         return frames
+
+    def _tell_time(self, now_s: float) -> None:
+        if self.signing is not None:
+            self.signing.unix_s = now_s + self.fleet_offset_s + self._epoch_unix_s
 
     # --- incoming ------------------------------------------------------------------------------------------
 
@@ -158,7 +172,7 @@ class AutopilotSession:
         self._last_heartbeat_s = now_s
         if self.state is not LinkState.CONNECTED:
             self.autopilot = found
-            self.samples.ardupilot = flavour == "ardupilot"
+            self.samples.flavour = flavour
             self.state = LinkState.CONNECTED
             self.rates.restart(now_s)
 

@@ -53,14 +53,23 @@ PLAIN_NAMES = {
 }
 
 
-def load_config(path: str | FilePath, overrides: Iterable[str] = ()) -> FleetConfig:
+def load_config(
+    path: str | FilePath, overrides: Iterable[str] = (), profiles: Iterable[str | FilePath] = ()
+) -> FleetConfig:
     """Read a fleet's configuration.
+
+    ``profiles`` are further TOML files laid over it in turn (`--with`), e.g. a link profile: their keys beat the
+    file's, tables are merged, ``[[agents]]`` by their ids; everything else is replaced.
 
     ``overrides`` are ``key=value`` with dotted keys and TOML values (a bare word is a string), e.g.
     ``estimator.window=3`` or ``agents.2.mavlink=udpin:127.0.0.1:14562``, where 2 is the agent's id. Raises
     `ConfigError`.
     """
-    return config_from(read_document(path), str(path), overrides)
+    document, where = read_document(path), str(path)
+    for profile in profiles:
+        document = merged(document, read_document(profile))
+        where += f" with {profile}"
+    return config_from(document, where, overrides)
 
 
 def load_estimator_settings(path: str | FilePath | None, overrides: Iterable[str] = ()) -> EstimatorSettings:
@@ -100,6 +109,24 @@ def read_document(path: str | FilePath) -> dict[str, Any]:
         raise ConfigError(file, "syntax", "valid TOML", str(error)) from error
 
 
+def merged(document: dict[str, Any], profile: dict[str, Any]) -> dict[str, Any]:
+    """A document with another one's keys laid over it; tables are merged, arrays of tables with an ``id`` by that."""
+    return document | {key: _laid_over(document.get(key), value) for key, value in profile.items()}
+
+
+def _laid_over(below: Any, above: Any) -> Any:
+    if isinstance(below, dict) and isinstance(above, dict):
+        return merged(below, above)
+    if _have_ids(below) and _have_ids(above):
+        tables = {table["id"]: table for table in below}
+        return list((tables | {each["id"]: merged(tables.get(each["id"], {}), each) for each in above}).values())
+    return above
+
+
+def _have_ids(value: Any) -> bool:
+    return isinstance(value, list) and all(isinstance(each, dict) and "id" in each for each in value)
+
+
 def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] = ()) -> FleetConfig:
     """The checked configuration of a decoded TOML document; ``where`` names it in errors."""
     overridden = {_override(document, override) for override in overrides}
@@ -113,6 +140,7 @@ def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] =
     _check_agents(config, where)
     _check_references(config, where)
     _check_times(config, where)
+    _check_radio(config, where)
     return config
 
 
@@ -327,6 +355,21 @@ def _check_references(config: FleetConfig, where: str) -> None:
         flown.add(path.agent)
 
 
+def _check_radio(config: FleetConfig, where: str) -> None:
+    """Datagrams between machines need addresses; the endpoints on loopback need free ports."""
+    transport = config.transport
+    for index, agent in enumerate(config.agents):
+        if transport.link != "tcp" and agent.radio is None and (agent.listen or agent.connect):
+            expected = f"an address, since transport.link is {transport.link} and listen or connect is given"
+            raise ConfigError(where, f"agents[{index}].radio", expected, "nothing")
+    for index, outage in enumerate(transport.faults.outages):
+        key = f"transport.faults.outages[{index}]"
+        _known(config, where, f"{key}.receivers", outage.receivers)
+        _known(config, where, f"{key}.senders", outage.senders)
+        if outage.to_s <= outage.from_s:
+            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
+
+
 def _known(config: FleetConfig, where: str, key: str, ids: Iterable[int]) -> None:
     for agent_id in ids:
         if agent_id not in config.ids:
@@ -342,7 +385,7 @@ def _check_times(config: FleetConfig, where: str) -> None:
     if transport.guard_s >= transport.exchange_fraction * config.fleet.period_s:
         expected = "less than transport.exchange_fraction of fleet.period_s"
         raise ConfigError(where, "transport.guard_s", expected, f"{transport.guard_s:g}")
-    last = transport.base_port + len(config.agents) - 1
+    last = transport.base_port + (1 if transport.link == "tcp" else 2) * len(config.agents) - 1
     if last > 65535:
         found = f"{last} for the last"
         raise ConfigError(where, "transport.base_port", "a port for each agent up to 65535", found)

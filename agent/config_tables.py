@@ -9,6 +9,11 @@ from typing import Annotated, Literal
 
 import msgspec
 
+from agent.config_monitor import AdsbTable, LogTable, MetricsTable, MonitorTable
+from agent.config_security import SecurityTable as SecurityTable
+from agent.config_sitl import SitlTable
+from agent.radio_faults import FaultsTable
+from agent.radio_links import LOOPBACK, RadioLink, radio_endpoints
 from estimators.settings import EstimatorSettings, default_settings
 
 AgentId = Annotated[int, msgspec.Meta(ge=1, le=999)]
@@ -48,7 +53,9 @@ class FleetTable(Table, frozen=True):
     Ticks are 32 bits wide on the wire, so that the epoch must be within 13 years at 10 Hz.
     """
     edges: tuple[tuple[AgentId, AgentId], ...] | None = None
-    """Who hears and ranges whom, both ways; absent = all pairs."""
+    """Who may hear and range whom, both ways; absent = neighbours are all who are heard."""
+    absent_after_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 10.0
+    """A drone of which nothing was heard or measured for longer is let go; it comes back when it is located again."""
 
 
 class AgentTable(Table, frozen=True):
@@ -62,8 +69,10 @@ class AgentTable(Table, frozen=True):
     autopilot: Literal["px4", "ardupilot", "auto"] = "auto"
     system_id: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None
     """MAVLink system id of the autopilot; absent = the agent's id (255 at most)."""
+    radio: str | None = None
+    """Address of this agent on the fleet's radio, IP or name; absent = its neighbours dial what it listens on."""
     listen: tuple[str, ...] | None = None
-    """Zenoh endpoints of this agent; absent = on loopback from ``transport.base_port``."""
+    """Zenoh endpoints of this agent besides those on the radio; absent = on loopback from ``transport.base_port``."""
     connect: tuple[str, ...] | None = None
     """Zenoh endpoints it dials; absent = those of the agents it hears that have a lower id."""
 
@@ -85,8 +94,13 @@ class MavlinkTable(Table, frozen=True):
     """The daemon gives up if no autopilot appears within this; 0 = it waits for ever. One that was there and
     disappears never stops it."""
     heartbeat_timeout_s: Positive = 3.0
+    end_after_lost_s: Positive | None = None
+    """An autopilot lost for this long ends the daemon, its records closed: for simulated flights; absent = never."""
     rate_floor: Fraction = 0.6
     """A stream below this share of its requested rate is requested again."""
+    signing: Literal["auto", "on", "off"] = "auto"
+    """Sign frames and refuse those that are not well signed: auto = in the field profiles on all links but serial
+    ones; off is refused there unless the link is serial or on loopback."""
 
 
 class SensorsTable(Table, frozen=True):
@@ -129,10 +143,16 @@ class SensorsTable(Table, frozen=True):
     """An IMU sample without an attitude this close is a gap too."""
     gravity_mps2: Positive | None = None
     """Absent = WGS84 normal gravity at the origin."""
-    imu_latency_s: float = 0.0
-    """How much older the value is than its stamp says, subtracted from it; the same below."""
-    gps_latency_s: float = 0.0
+    imu_latency_s: float | None = None
+    """How much older the value is than its stamp says; absent = the autopilot's profile (docs/latency.md)."""
+    gps_latency_s: float | None = None
+    """The same of a fix; absent = the autopilot's profile, by the kind of stamp."""
+    gps_latency_sigma_s: NotNegative | None = None
+    """1-sigma of it; absent = the profile's, or 0 (exactly known, not estimated) where ``gps_latency_s`` is given."""
+    estimate_latency: bool = True
+    """Estimate the latency of GPS on line from manoeuvres, from there on; else it stays as assumed."""
     uwb_latency_s: float = 0.0
+    """How much older a range is than its driver says, subtracted from its time."""
 
 
 class InitialTable(Table, frozen=True):
@@ -149,10 +169,8 @@ class InitialTable(Table, frozen=True):
     """About the velocity that the first fixes show, or about zero."""
     fixes: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
     """Own GPS fixes before the estimator starts."""
-    settle_s: NotNegative = 2.0
-    """With own fixes: wait this long for the first records of the others."""
-    max_wait_s: NotNegative = 10.0
-    """Without own GPS: start from the neighbours' fixes after this long."""
+    max_wait_s: NotNegative = 2.0
+    """Without own fixes: start among the others, own place not observable yet, after this long."""
 
 
 class TransportTable(Table, frozen=True):
@@ -160,6 +178,19 @@ class TransportTable(Table, frozen=True):
 
     base_port: Annotated[int, msgspec.Meta(ge=1024, le=64_000)] = 17_447
     """Agent number i (from 0, in order of the file) listens on loopback at this port + i."""
+    link: RadioLink = "tcp"
+    """What carries packets between agents: a stream, datagrams, or both (rounds on datagrams).
+    docs/links.md says which serves where; only ``tcp`` (TLS then) goes with ``security.profile = "field"``."""
+    radio_port: Annotated[int, msgspec.Meta(ge=1, le=65_535)] = 7447
+    """Where every agent listens at its address ``agents.radio``."""
+    lease_s: Annotated[float, msgspec.Meta(ge=0.1, le=600)] = 2.0
+    """Silence of a link after which neighbours consider this agent gone."""
+    open_timeout_s: Annotated[float, msgspec.Meta(ge=0.1, le=600)] = 1.5
+    """Longest time that a link may take to be opened before it is tried anew."""
+    retry_max_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 2.0
+    """Longest pause before a neighbour that does not answer is dialled again; from 0.2 s on they double."""
+    redeclare_after_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 1.0
+    """A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
     guard_s: NotNegative = 0.01
     """A tick is closed this long after its end, when its last samples have come in."""
     exchange_fraction: Fraction = 0.3
@@ -179,16 +210,8 @@ class TransportTable(Table, frozen=True):
     delay_jitter_s: NotNegative = 0.0
     """Injected after receive: mean of an exponential delay on top."""
     seed: Seed = 0
-
-
-class SecurityTable(Table, frozen=True):
-    """``[security]``: signatures of packets. Unsigned is for the lab and has to be asked for."""
-
-    mode: Literal["signed", "unsigned"] = "signed"
-    keys: str = "keys"
-    """Folder of the key files, relative to the configuration file."""
-    freshness_s: Positive = 10.0
-    """Packets whose sender's UTC clock differs by more are refused, which also stops replays after a restart."""
+    faults: FaultsTable = msgspec.field(default_factory=FaultsTable)
+    """What else is injected after receive."""
 
 
 class GpsOutage(Table, frozen=True):
@@ -262,7 +285,20 @@ class RecordTable(Table, frozen=True):
     directory: str | None = None
     """Relative to the working folder; absent = record nothing."""
     max_mb: Positive = 200.0
-    """Per agent; a record stops growing here; the daemon goes on."""
+    """Of an agent's estimates; the file stops growing here, the daemon goes on."""
+    flight: bool = True
+    """Whether to write a flight record beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
+    flight_max_mb: Positive = 2000.0
+    """Of a flight record, both files together; it ends here, the daemon goes on."""
+    min_free_mb: NotNegative = 100.0
+    """A flight record ends when its disk has less left."""
+
+
+class HealthTable(Table, frozen=True):
+    """``[health]``: how a daemon answers those who look after it (`fleetloc health`)."""
+
+    socket: str | None = None
+    """Path of a UNIX socket that tells the daemon's state to whoever connects; absent = none."""
 
 
 class FleetConfig(Table, frozen=True):
@@ -278,6 +314,12 @@ class FleetConfig(Table, frozen=True):
     security: SecurityTable = msgspec.field(default_factory=SecurityTable)
     sim: SimTable = msgspec.field(default_factory=SimTable)
     record: RecordTable = msgspec.field(default_factory=RecordTable)
+    health: HealthTable = msgspec.field(default_factory=HealthTable)
+    metrics: MetricsTable = msgspec.field(default_factory=MetricsTable)
+    log: LogTable = msgspec.field(default_factory=LogTable)
+    adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)
+    monitor: MonitorTable = msgspec.field(default_factory=MonitorTable)
+    sitl: SitlTable = msgspec.field(default_factory=SitlTable)
 
     @property
     def ids(self) -> tuple[int, ...]:
@@ -304,9 +346,13 @@ class FleetConfig(Table, frozen=True):
 
     def listen(self, agent_id: int) -> tuple[str, ...]:
         """Zenoh endpoints an agent listens on."""
+        return tuple(dict.fromkeys((*self.device_endpoints(agent_id), *self._on_radio(agent_id))))
+
+    def device_endpoints(self, agent_id: int) -> tuple[str, ...]:
+        """Where a drone's own UWB driver, or an observer of the ground, dials its agent."""
         own = self.agent(agent_id).listen
-        port = self.transport.base_port + self.ids.index(agent_id)
-        return (f"tcp/127.0.0.1:{port}",) if own is None else own
+        link = "tls" if self.security.profile == "field" else "tcp"
+        return (f"{link}/{LOOPBACK}:{self._base_port(agent_id)}",) if own is None else own
 
     def connect(self, agent_id: int) -> tuple[str, ...]:
         """Zenoh endpoints an agent dials: one side of each pair does, or both would build a link."""
@@ -314,4 +360,18 @@ class FleetConfig(Table, frozen=True):
         if own is not None:
             return own
         lower = (other for other in self.neighbours(agent_id) if other < agent_id)
-        return tuple(endpoint for other in lower for endpoint in self.listen(other))
+        return tuple(endpoint for other in lower for endpoint in self._on_radio(other))
+
+    def _on_radio(self, agent_id: int) -> tuple[str, ...]:
+        """What neighbours dial."""
+        link, host = self.transport.link, self.agent(agent_id).radio
+        if host is not None:
+            secure = self.security.profile == "field"
+            return radio_endpoints(link, host, self.transport.radio_port, secure=secure)
+        if link == "tcp":
+            return self.device_endpoints(agent_id)
+        port_above_the_devices = self._base_port(agent_id) + len(self.agents)
+        return radio_endpoints(link, LOOPBACK, port_above_the_devices)
+
+    def _base_port(self, agent_id: int) -> int:
+        return self.transport.base_port + self.ids.index(agent_id)

@@ -18,7 +18,6 @@ The estimate is of the tick's start k T, from all measurements nearer to it than
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Callable
 from enum import Enum, auto
 
 import numpy as np
@@ -26,33 +25,25 @@ import numpy as np
 from agent.config_tables import FleetConfig
 from agent.frames import gravity_mps2
 from agent.health import Facts, HealthMonitor
-from agent.initial import Initialiser
+from agent.latency import GpsLatency
 from agent.neighbours import NeighbourTable
 from agent.outputs import EstimateReady, HealthChanged, Output, Send, estimate_message
 from agent.record_store import RecordStore
 from agent.records import acceleration_record, gps_records, range_record
 from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
 from agent.timeline import TickInput, Timeline, tick_of
-from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
-from estimators.layout import STATES_PER_AGENT, Layout, block
-from estimators.measurements import Matrix, Vector
-from estimators.settings import EstimatorSettings
-from transport.estimate_body import MAX_AGE_TICKS
+from agent.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
+from agent.tracking import EstimatorFactory as EstimatorFactory
+from agent.tracking import FleetTracker, in_layout
+from estimators.estimator import Estimate
+from estimators.layout import Layout, block
 from transport.information_body import Information
 from transport.measurement_body import Measurements, Record
 from transport.opening import Received
 from transport.rounds import RoundBarrier
 
-EstimatorFactory = Callable[[EstimatorSettings, Layout, int, Vector, Matrix, float], Estimator]
-"""(settings, layout, own slot, prior mean, prior covariance, period in s) -> estimator."""
-
-ESTIMATOR_FAULTS = (ArithmeticError, ValueError)
-"""What broken numerics raise (numpy's LinAlgError is a ValueError): the estimator starts anew, nothing stops."""
 MAX_BEHIND_TICKS = 50
 """Further behind (a suspended computer, a clock set forward), the ticks between are left out."""
-MAX_MEAN = 1e6
-RESTART_VARIANCE = 1.0
-"""What a start from the last good estimate adds to its covariance, in m2 and (m/s)2."""
 
 
 class _Phase(Enum):
@@ -73,23 +64,21 @@ class AgentCore:
     def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory) -> None:
         self._config = config
         self._agent_id = agent_id
-        self._make_estimator = make_estimator
         self._period_s = config.fleet.period_s
         self.layout = Layout(config.ids)
-        self._slot = self.layout.slot(agent_id)
+        """Of all who may come: that of the estimates handed out."""
         self.timeline = Timeline(self._period_s, gravity_mps2(config), config.sensors)
+        self.gps_latency = GpsLatency(self._period_s, config.sensors)
         self.records = RecordStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
         self.health = HealthMonitor()
         self.counters: Counter[str] = Counter()
+        self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters)
         self.last_fault: Exception | None = None
         """What the estimator raised last, for the log."""
         self.autopilot_state = "searching"
         """State of the autopilot's link, for the health; kept by the owner."""
-        self._initialiser = Initialiser(config, agent_id)
-        self._barrier: RoundBarrier[Payload] = RoundBarrier(max(config.estimator.rounds, 1))
-        self._estimator: Estimator | None = None
-        self._good: Estimate | None = None
+        self._barrier: RoundBarrier[Information] = RoundBarrier(max(config.estimator.rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
         self._tick: int | None = None
@@ -113,7 +102,8 @@ class AgentCore:
         if not self._plausible("gps", sample.t_s, now_s):
             return
         self._last_fix_s = now_s
-        for record in gps_records(self._agent_id, sample, self._period_s, self._config.sensors):
+        corrected = self.gps_latency.on_fix(sample)
+        for record in gps_records(self._agent_id, corrected, self._period_s, self._config.sensors):
             self._on_own_record(record)
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
@@ -153,24 +143,21 @@ class AgentCore:
 
     def _on_own_record(self, record: Record) -> None:
         rounded = self.records.add_own(record)
-        if rounded is not None and self._estimator is None:
-            self._initialiser.note(rounded)
+        if rounded is not None:
+            self.fleet.note(rounded, rounded.tick if self._tick is None else self._tick)
 
     def _on_measurements(self, sender: int, message: Measurements) -> None:
         assert self._tick is not None
         self.neighbours.on_measurements(sender, message.tick)
+        self.records.neighbourhood.hear(sender, self._tick)
         if message.tick < self._tick or (message.tick == self._tick and self._phase is _Phase.ROUND):
             self.counters["measurements: late"] += 1
         for record in message.records:
-            if self.records.add_heard(record, self._tick) and self._estimator is None:
-                self._initialiser.note(record)
+            if self.records.add_heard(record, self._tick):
+                self.fleet.note(record, self._tick)
 
     def _on_information(self, sender: int, message: Information, now_s: float) -> None:
-        if message.agents != self.layout.agents:
-            self.counters["information: other agents"] += 1
-            return
-        payload = Payload(message.state_tick, message.information, message.vector, message.rank)
-        outcome = self._barrier.put(sender, message.tick, message.round, payload)
+        outcome = self._barrier.put(sender, message.tick, message.round, message)
         self.counters[f"information: {outcome.name.lower()}"] += 1
         self.neighbours.on_information(sender, now_s)
 
@@ -224,63 +211,40 @@ class AgentCore:
     def _close_tick(self, outputs: list[Output]) -> None:
         assert self._tick is not None
         self._input = self.timeline.close(self._tick)
-        self.records.add_own(acceleration_record(self._agent_id, self._input))
+        self.gps_latency.on_tick(self._input)
+        self._on_own_record(acceleration_record(self._agent_id, self._input))
         outputs.append(Send(self.records.packet(self._tick)))
         self._phase = _Phase.PACKETS
 
     def _begin(self, now_s: float, outputs: list[Output]) -> None:
         assert self._tick is not None
-        rows, inputs = self.records.take(self._tick)
-        if self._estimator is None:
-            if self._good is None and not self._initialiser.ready(self._tick, now_s):
-                self._finish(self._nothing(), now_s, outputs)
-                return
-            self._start()
-            rows, inputs = rows[rows["tick"] == self._tick], inputs[:0]
-        estimator = self._estimator
-        assert estimator is not None
         try:
-            estimator.begin(self._tick, rows, inputs)
+            started = self.fleet.begin(self._tick, now_s, self.records)
         except ESTIMATOR_FAULTS as fault:
             self._finish(self._after_fault(fault), now_s, outputs)
+            return
+        if not started:
+            self._finish(self.fleet.nothing(self._tick), now_s, outputs)
             return
         self._round = 0
         self._open_round_or_solve(now_s, outputs)
 
     def _open_round_or_solve(self, now_s: float, outputs: list[Output]) -> None:
-        assert self._estimator is not None
         assert self._tick is not None
         rounds = self._config.estimator.rounds
         if self._round >= rounds:
             self._solve(now_s, outputs)
             return
-        payload = self._estimator.outgoing(self._round)
-        message = Information(
-            self._tick,
-            self._round,
-            payload.tick,
-            payload.rank,
-            self.layout.agents,
-            payload.information,
-            payload.vector,
-        )
-        outputs.append(Send(message))
+        outputs.append(Send(self.fleet.outgoing(self._tick, self._round)))
         share_s = self._config.transport.rounds_fraction * self._period_s / rounds
         deadline_s = self._packets_by_s + (self._round + 1) * share_s
         self._barrier.open(self._tick, self._round, self.neighbours.informing(now_s), deadline_s)
         self._phase = _Phase.ROUND
 
     def _mix(self, now_s: float, outputs: list[Output]) -> None:
-        assert self._estimator is not None
-        own_tick = self._estimator.outgoing(self._round).tick
-        received: dict[int, Payload] = {}
-        for sender, payload in self._barrier.close().items():
-            if payload.tick == own_tick:
-                received[self.layout.slot(sender)] = payload
-            else:  # its window is shorter, as for a few ticks after its start
-                self.counters["information: other window"] += 1
+        received = self._barrier.close()
         try:
-            self._estimator.mix(self._round, received)
+            self.fleet.mix(self._round, received)
         except ESTIMATOR_FAULTS as fault:
             self._finish(self._after_fault(fault), now_s, outputs)
             return
@@ -288,72 +252,37 @@ class AgentCore:
         self._open_round_or_solve(now_s, outputs)
 
     def _solve(self, now_s: float, outputs: list[Output]) -> None:
-        assert self._estimator is not None
         try:
-            estimate = self._estimator.solve()
-            if not _sound(estimate):
-                raise ArithmeticError("the estimate is not finite or its covariance not positive")
-            self._good = estimate
+            estimate = self.fleet.solve()
         except ESTIMATOR_FAULTS as fault:
             estimate = self._after_fault(fault)
         self._finish(estimate, now_s, outputs)
 
     def _finish(self, estimate: Estimate, now_s: float, outputs: list[Output]) -> None:
+        """Hand out an estimate of those who are present, and go on to the next tick."""
         assert self._tick is not None
         t_s, end_s = self._tick * self._period_s, self._end_s
         on_time = now_s <= end_s + self._period_s
         self.counters["ticks"] += 1
         self.counters["ticks: late"] += not on_time
         self.counters[f"status: {estimate.status.name.lower()}"] += 1
-        outputs.append(EstimateReady(estimate, t_s, now_s, on_time))
-        outputs.append(Send(estimate_message(estimate, self.layout.agents, block(self._slot))))
-        changed = self.health.update(self._facts(estimate, now_s), now_s)
+        present = self.fleet.present
+        own = block(present.index(self._agent_id))
+        outputs.append(EstimateReady(in_layout(estimate, present, self.layout), t_s, now_s, on_time))
+        outputs.append(Send(estimate_message(estimate, present, own)))
+        changed = self.health.update(self._facts(estimate, own, now_s), now_s)
         if changed is not None:
             outputs.append(HealthChanged(changed))
         self._enter(self._tick + 1)
 
-    # --- start, faults, gaps -------------------------------------------------------------------------------
-
-    def _start(self) -> None:
-        assert self._tick is not None
-        if self._good is None:
-            mean, covariance = self._initialiser.prior(self._tick)
-        else:  # after a fault: where we were going, less sure of it
-            mean = self._carried(self._good)
-            covariance = self._good.covariance + RESTART_VARIANCE * np.eye(self.layout.dimension)
-        settings = self._config.estimator
-        self._estimator = self._make_estimator(settings, self.layout, self._slot, mean, covariance, self._period_s)
-        self.counters["starts"] += 1
-
-    def _nothing(self) -> Estimate:
-        assert self._tick is not None
-        mean, covariance = self._initialiser.no_data()
-        ages = np.full(self.layout.size, MAX_AGE_TICKS)
-        return Estimate(self._tick, mean, covariance, Status.NO_DATA, ages, SolverReport())
+    # --- faults, gaps --------------------------------------------------------------------------------------
 
     def _after_fault(self, fault: Exception) -> Estimate:
-        """Give what follows from the last good estimate, flagged, and start anew from that at the next tick."""
+        """What follows from the last good estimate, flagged; the estimator starts anew from that at the next tick."""
         assert self._tick is not None
         self.counters["estimator faults"] += 1
         self.last_fault = fault
-        self._restart()
-        if self._good is None:
-            return self._nothing()
-        good = self._good
-        covariance = good.covariance + RESTART_VARIANCE * np.eye(self.layout.dimension)
-        mean = self._carried(good)
-        return Estimate(self._tick, mean, covariance, Status.FELL_BACK, good.age_ticks, SolverReport())
-
-    def _carried(self, good: Estimate) -> Vector:
-        """The mean ``(6n,)`` of an earlier estimate, moved on to this tick at its velocities."""
-        assert self._tick is not None
-        states = good.mean.reshape(-1, STATES_PER_AGENT).copy()
-        states[:, :3] += (self._tick - good.tick) * self._period_s * states[:, 3:]
-        return np.asarray(states.ravel())
-
-    def _restart(self) -> None:
-        self._estimator = None
-        self._initialiser = Initialiser(self._config, self._agent_id)
+        return self.fleet.fall_back(self._tick)
 
     def _leave_out_ticks(self, now_s: float) -> None:
         """Go to the tick of now; an estimator cannot jump, so it starts anew."""
@@ -362,8 +291,7 @@ class AgentCore:
         self.counters["ticks: left out"] += tick - self._tick
         if self._phase is _Phase.ROUND:
             self._barrier.close()
-        self._restart()
-        self._good = None
+        self.fleet.forget()
         self._enter(tick)
 
     # --- common --------------------------------------------------------------------------------------------
@@ -377,23 +305,19 @@ class AgentCore:
     def _packets_by_s(self) -> float:
         return self._end_s + self._config.transport.exchange_fraction * self._period_s
 
-    def _facts(self, estimate: Estimate, now_s: float) -> Facts:
-        started = self._estimator is not None
-        own = estimate.covariance.diagonal()[block(self._slot)][:3]
+    def _facts(self, estimate: Estimate, own: slice, now_s: float) -> Facts:
+        assert self._tick is not None
+        started = self.fleet.started
+        near, directions = self.fleet.roll.anchors(self._agent_id, self._tick)
         return Facts(
-            status=estimate.status if started or self._good is not None else None,
-            own_sigma_m=float(np.sqrt(own.max())),
+            status=estimate.status if started else None,
+            own_sigma_m=float(np.sqrt(estimate.covariance.diagonal()[own][:3].max())),
             gps_age_s=self.gps_age_s(now_s),
             imu_coverage=0.0 if self._input is None else self._input.coverage,
             silent_neighbours=self.neighbours.silent(now_s),
             autopilot=self.autopilot_state,
             waiting_for="" if started else "waiting for fixes",
+            located_neighbours=near,
+            directions=directions,
+            ambiguous=self.fleet.roll.ambiguous,
         )
-
-
-def _sound(estimate: Estimate) -> bool:
-    """Whether an estimate is fit to leave the house, whatever its estimator promised."""
-    diagonal = estimate.covariance.diagonal()
-    return bool(
-        np.isfinite(estimate.covariance).all() and (np.abs(estimate.mean) <= MAX_MEAN).all() and (diagonal > 0).all()
-    )

@@ -11,12 +11,11 @@ import gc
 import logging
 import signal
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agent.autopilot import AutopilotSession, LinkState
-from agent.clock import FleetClock
+from agent.autopilot import LinkState
 from agent.config_tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.diagnostics import (
@@ -27,20 +26,19 @@ from agent.diagnostics import (
     gauges_of,
     neighbour_gauges,
 )
-from agent.endpoints import LinkKind, parse_endpoint
+from agent.endpoints import parse_endpoint
 from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
 from agent.exit_codes import ExitCode
-from agent.health import State
-from agent.mavlink_codec import mavlink
 from agent.mavlink_link import create_link
+from agent.mavlink_stamps import StampKeeper
+from agent.observers import DaemonState, Observer
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady, HealthChanged, Output, Send
 from agent.radio import Radio
-from agent.recording import SUFFIX, EstimateRecorder, RecordHeader, write_summary
-from agent.samples import AttitudeSample, GpsSample, ImuSample, Sample
-from agent.uwb import UwbAdapter
+from agent.run_record import RunRecord
+from agent.security import mavlink_signing, stamp_file
 from agent.warmup import warm_up
 from transport.errors import KeyFileError, SessionError, SettingsError
-from transport.opening import Received
 
 LOG = logging.getLogger("fleetloc.agent")
 MAVLINK_PERIOD_S = 0.05
@@ -48,13 +46,6 @@ HOUSEKEEPING_PERIOD_S = 1.0
 MAX_FAULT_TRACES = 10
 FAULT_LINE_PERIOD_S = 10.0
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
-SYSTEM_STATUS = {
-    State.INIT: mavlink.MAV_STATE_BOOT,
-    State.ALIGNING: mavlink.MAV_STATE_STANDBY,
-    State.OK: mavlink.MAV_STATE_ACTIVE,
-    State.DEGRADED: mavlink.MAV_STATE_CRITICAL,
-    State.FAULT: None,  # a component that is at fault sends no heartbeat
-}
 EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
     (ConfigError, ExitCode.CONFIG),
     (SettingsError, ExitCode.CONFIG),
@@ -66,15 +57,23 @@ EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
 )
 
 
-def run(config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, *, base: Path = Path()) -> ExitCode:
+def run(
+    config: FleetConfig,
+    agent_id: int,
+    make_estimator: EstimatorFactory,
+    *,
+    base: Path = Path(),
+    observers: Sequence[Observer] = (),
+) -> ExitCode:
     """Run the daemon of one agent until it is told to stop.
 
-    ``base`` is the folder of the configuration file, which the key folder is relative to.
+    ``base`` is the folder of the configuration file, which the key folder is relative to; ``observers`` are told
+    of every estimate, and of the state once a second.
     """
     try:
         if agent_id not in config.ids:
             raise ConfigError("agent", "id", f"one of {', '.join(map(str, config.ids))}", str(agent_id))
-        daemon = Daemon(config, agent_id, make_estimator, base)
+        daemon = Daemon(config, agent_id, make_estimator, base, observers)
         warm_up(config, agent_id, make_estimator)
         asyncio.run(daemon.run())
     except KeyboardInterrupt:  # before the loop takes over the signals: nothing is open yet
@@ -89,30 +88,48 @@ def run(config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, *,
 class Daemon:
     """One agent with its surroundings; made for one `run`.
 
-    ``core`` and ``radio`` are there to be looked at; a step of the system's clock brings a new core.
+    ``onboard`` (the agent itself) and ``radio`` are there to be looked at.
     """
 
-    def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, base: Path) -> None:
+    def __init__(
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        make_estimator: EstimatorFactory,
+        base: Path,
+        observers: Sequence[Observer] = (),
+    ) -> None:
         self._config = config
         self._agent_id = agent_id
-        self._make_core: Callable[[], AgentCore] = lambda: AgentCore(config, agent_id, make_estimator)
-        self._clock = FleetClock(config.fleet.epoch_unix_s, unix_s=time.time(), host_s=time.monotonic())
-        self.core = self._make_core()
-        endpoint = parse_endpoint(config.agent(agent_id).mavlink)
-        datagrams = endpoint.kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
-        self._autopilot = AutopilotSession(config, agent_id, datagrams=datagrams)
-        self._link = create_link(endpoint, self._on_mavlink)
-        self._uwb = UwbAdapter(agent_id, config.ids, config.sensors)
-        self.radio = Radio(config, agent_id, base, self._on_received, self._on_uwb, self._on_gone)
+        self._link = create_link(parse_endpoint(config.agent(agent_id).mavlink), self._on_mavlink)
+        self.radio = Radio(config, agent_id, base, self._on_packet, self._on_uwb, self._on_gone)
+        unix_s, host_s = time.time(), time.monotonic()
+        trust = self.radio.trust
+        signing = mavlink_signing(config, agent_id, base, unix_s=unix_s)
+        self.onboard = OnboardAgent(
+            config, agent_id, make_estimator, trust, unix_s=unix_s, host_s=host_s, signing=signing
+        )
+        self._record: RunRecord | None = None
+        if config.record.directory is not None:
+            directory = Path(config.record.directory)
+            self._record = RunRecord(config, agent_id, directory, trust, unix_s=unix_s, host_s=host_s)
+            self.onboard.journal = self._record.flight
+        self._observers = tuple(observers)
+        if signing is not None:
+            self._observers += (StampKeeper(signing, stamp_file(config, agent_id, base)),)
         self._ticks = TickTimes()
         self._use = ProcessUse()
-        self._recorder = self._open_record()
         self._tick_timer: asyncio.TimerHandle | None = None
         self._computing_s = 0.0
         self._faults = 0
         self._next_fault_line_s = 0.0
         self._stop = asyncio.Event()
         self._failure: AgentError | None = None
+
+    @property
+    def core(self) -> AgentCore:
+        """The agent's core; a step of the system's clock brings a new one."""
+        return self.onboard.core
 
     # --- life ----------------------------------------------------------------------------------------------
 
@@ -127,6 +144,8 @@ class Daemon:
             await self._link.open()
             LOG.info("agent %d: mavlink %s", self._agent_id, self._link.description)
             await self.radio.open()
+            for observer in self._observers:
+                await observer.open()
             tasks = [
                 asyncio.create_task(self._serve_mavlink(), name="mavlink"),
                 asyncio.create_task(self._keep_house(), name="housekeeping"),
@@ -173,49 +192,45 @@ class Daemon:
         await asyncio.gather(*tasks, return_exceptions=True)  # their failures are in `_failure` already
         await self.radio.close()
         await self._link.close()
-        if self._recorder is not None:
-            self._recorder.close()
-            write_summary(self._recorder.path.with_suffix(".json"), self.summary())
+        state = self.state()
+        last: list[Observer] = [] if self._record is None else [self._record]
+        ends = [observer.close(state) for observer in (*self._observers, *last)]
+        for error in await asyncio.gather(*ends, return_exceptions=True):
+            if isinstance(error, AgentError):
+                self._failure = self._failure or error
+            elif error is not None:
+                LOG.error("agent %d: an observer failed to close", self._agent_id, exc_info=error)
 
     # --- MAVLink -------------------------------------------------------------------------------------------
 
     def _on_mavlink(self, data: bytes) -> bool:
-        """Whether the autopilot's system sent it: a stranger's frames must not draw our answers away from it."""
-        host_s = time.monotonic()
-        self._autopilot.fleet_offset_s = self._clock.offset_s
-        before = self._autopilot.heard
-        for sample in self._autopilot.receive(data, host_s):
-            self._on_sample(sample, self._clock.fleet_s(host_s))
-        return self._autopilot.heard > before
-
-    def _on_sample(self, sample: Sample, now_s: float) -> None:
-        if isinstance(sample, ImuSample):
-            self.core.on_imu(sample, now_s)
-        elif isinstance(sample, AttitudeSample):
-            self.core.on_attitude(sample, now_s)
-        elif isinstance(sample, GpsSample):
-            self.core.on_gps(sample, now_s)
+        return self.onboard.on_mavlink(data, time.monotonic())
 
     async def _serve_mavlink(self) -> None:
         """Send what is due on the autopilot's link, and say when its state changes."""
         state = LinkState.SEARCHING
         started_s = time.monotonic()
-        limit_s = self._config.mavlink.appear_timeout_s
+        changed_s = started_s
+        limit_s, end_after_s = self._config.mavlink.appear_timeout_s, self._config.mavlink.end_after_lost_s
         while True:
             host_s = time.monotonic()
-            self._autopilot.system_status = SYSTEM_STATUS[self.core.health.health.state]
-            for frame in self._autopilot.to_send(host_s):
+            for frame in self.onboard.serve_autopilot(host_s):
                 self._link.send(frame)
-            if self._autopilot.state is not state:
-                state = self._autopilot.state
+            if self.onboard.autopilot.state is not state:
+                state, changed_s = self.onboard.autopilot.state, host_s
+                if state is LinkState.CONNECTED:
+                    self.radio.begin_flight(host_s)
                 LOG.info("agent %d: autopilot %s, %s", self._agent_id, state, self._link.description)
-            self.core.autopilot_state = str(state)
             if state is LinkState.SEARCHING and 0 < limit_s < host_s - started_s:
                 raise NoAutopilotError(self._searched_in_vain(limit_s))
+            if state is LinkState.LOST and end_after_s is not None and host_s - changed_s > end_after_s:
+                LOG.info("agent %d: autopilot lost for %g s: end, as configured", self._agent_id, end_after_s)
+                self.stop()
+                return
             await asyncio.sleep(MAVLINK_PERIOD_S)
 
     def _searched_in_vain(self, limit_s: float) -> str:
-        seen = ", ".join(self._autopilot.ignored) or "nothing"
+        seen = ", ".join(self.onboard.autopilot.ignored) or "nothing"
         system = self._config.system_id(self._agent_id)
         flavour = self._config.agent(self._agent_id).autopilot
         return (
@@ -225,24 +240,18 @@ class Daemon:
 
     # --- radio ---------------------------------------------------------------------------------------------
 
-    def _on_received(self, received: Received) -> None:
-        self.core.on_packet(received, self._now_s())
+    def _on_packet(self, key: str, data: bytes, arrived_s: float, unix_ns: int) -> None:
+        self.onboard.on_packet(key, data, arrived_s=arrived_s, host_s=time.monotonic(), unix_ns=unix_ns)
         self._advance()
 
     def _on_uwb(self, payload: bytes, arrived_s: float) -> None:
-        now_s = self._clock.fleet_s(arrived_s)
-        unix_s = now_s + self._config.fleet.epoch_unix_s
-        for sample in self._uwb.receive(payload, now_s=now_s, host_s=arrived_s, unix_s=unix_s):
-            self.core.on_range(sample, now_s)
+        self.onboard.on_uwb(payload, arrived_s)
 
     def _on_gone(self, agent_id: int) -> None:
-        self.core.on_gone(agent_id)
+        self.onboard.on_gone(agent_id, time.monotonic())
         self._advance()
 
     # --- the core ------------------------------------------------------------------------------------------
-
-    def _now_s(self) -> float:
-        return self._clock.fleet_s(time.monotonic())
 
     def _advance(self) -> None:
         """Let the core do what is due, put out what it gives, and come back when it wants to."""
@@ -250,34 +259,38 @@ class Daemon:
             return
         if self._tick_timer is not None:
             self._tick_timer.cancel()
+        host_s = time.monotonic()
         # Should the core fail, the loop reports it and the next period tries again.
-        retry_s = self._now_s() + self._config.fleet.period_s
-        due_s: float | None = retry_s
+        due_host_s = retry_host_s = host_s + self._config.fleet.period_s
         began_s = time.perf_counter()
         try:
-            outputs = self.core.advance(self._now_s())
+            outputs = self.onboard.advance(host_s)
             for output in outputs:
                 if isinstance(output, Send):
                     self.radio.send(output.message)
             self._computing_s += time.perf_counter() - began_s
             self._report(outputs)
-            due_s = self.core.next_due_s()
+            due_host_s = self.onboard.next_due_host_s() or retry_host_s
         finally:
-            loop = asyncio.get_running_loop()
-            self._tick_timer = loop.call_at((due_s or retry_s) - self._clock.offset_s, self._advance)
+            self._tick_timer = asyncio.get_running_loop().call_at(due_host_s, self._advance)
 
     def _report(self, outputs: list[Output]) -> None:
         for output in outputs:
             if isinstance(output, EstimateReady):
-                published_s = self._now_s()
-                period_s = self._config.fleet.period_s
-                self._ticks.add(self._computing_s, published_s - output.t_s - period_s)
-                if self._recorder is not None:
-                    self._recorder.write(output, published_s, self._computing_s)
-                self._computing_s = 0.0
+                published_s = self.onboard.fleet_s(time.monotonic())
+                self._ticks.add(self._computing_s, published_s - output.t_s - self._config.fleet.period_s)
+                tick_time_s, self._computing_s = self._computing_s, 0.0
+                if self._record is not None:  # at once: it says how many inputs the estimate had
+                    self._record.on_estimate(output, published_s, tick_time_s)
+                for observer in self._observers:
+                    self._tell(observer.on_estimate, output, published_s, tick_time_s)
             elif isinstance(output, HealthChanged):
                 LOG.info("agent %d: %s", self._agent_id, output.health)
         self._report_fault()
+
+    def _tell(self, listener: Callable[..., None], *what: object) -> None:
+        """Each in a callback of its own: one that fails is reported by the loop and stops no other."""
+        asyncio.get_running_loop().call_soon(listener, *what)
 
     def _report_fault(self) -> None:
         """Say what the estimator raised, once in a while; every fault is counted."""
@@ -292,47 +305,26 @@ class Daemon:
     async def _keep_house(self) -> None:
         while True:
             await asyncio.sleep(HOUSEKEEPING_PERIOD_S)
-            if self._clock.sync(unix_s=time.time(), host_s=time.monotonic()):
+            if self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()):
                 LOG.warning("agent %d: the system's clock stepped; starting anew", self._agent_id)
-                self.core = self._make_core()
                 self._advance()
-            now_s = self._now_s()
-            self.radio.expire(time.monotonic())
-            counters, gauges, neighbours = self._state(now_s)
-            self.radio.send(diagnostics_of(self._agent_id, self.core, counters, gauges, neighbours))
+            state = self.state()
+            message = diagnostics_of(self._agent_id, self.core, state.counters, state.gauges, state.neighbours)
+            self.radio.send(message)
+            if self._record is not None:
+                self._record.on_second(state)
+            for observer in self._observers:
+                self._tell(observer.on_second, state)
             await self.radio.ask_clocks()
 
-    def _state(self, now_s: float) -> tuple[dict[str, int], dict[str, float], dict[str, dict[str, float]]]:
-        opener = self.radio.opener
-        counters = counters_of(self.core, self._autopilot, self._link, self._uwb, opener)
+    def state(self) -> DaemonState:
+        """How the daemon is at this moment."""
+        onboard, host_s = self.onboard, time.monotonic()
+        now_s = onboard.fleet_s(host_s)
+        counters = counters_of(self.core, onboard.autopilot, self._link, onboard.uwb, onboard.opener)
         counters |= self.radio.counters() | {"program faults": self._faults}
-        gauges = gauges_of(self.core, self._autopilot, now_s)
-        gauges |= self._ticks.gauges() | self._use.gauges()
-        return counters, gauges, neighbour_gauges(opener, self.core, time.monotonic(), now_s)
-
-    def summary(self) -> dict[str, object]:
-        """What is written beside the record at the end."""
-        counters, gauges, neighbours = self._state(self._now_s())
-        health = self.core.health.health
-        return {
-            "agent": self._agent_id,
-            "state": str(health.state),
-            "reasons": list(health.reasons),
-            "counters": counters,
-            "gauges": gauges,
-            "neighbours": neighbours,
-        }
-
-    def _open_record(self) -> EstimateRecorder | None:
-        settings = self._config.record
-        if settings.directory is None:
-            return None
-        header = RecordHeader(
-            fleet=self._config.fleet.name,
-            agent=self._agent_id,
-            agents=self._config.ids,
-            period_s=self._config.fleet.period_s,
-            epoch_unix_s=self._config.fleet.epoch_unix_s,
-        )
-        path = Path(settings.directory) / f"agent_{self._agent_id:03d}{SUFFIX}"
-        return EstimateRecorder(path, header, int(settings.max_mb * 1e6))
+        if self._record is not None:
+            counters |= self._record.counters()
+        gauges = gauges_of(self.core, onboard.autopilot, now_s) | self._ticks.gauges() | self._use.gauges()
+        neighbours = neighbour_gauges(onboard.opener, self.core, host_s, now_s)
+        return DaemonState(self._agent_id, now_s, self.core.health.health, counters, gauges, neighbours)

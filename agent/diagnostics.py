@@ -93,9 +93,11 @@ def counters_of(
         ("", dict(core.counters)),
         ("mavlink ignored ", dict(session.ignored)),
         ("mavlink bad ", dict(decoder.bad)),
+        ("mavlink refused ", {} if decoder.signing is None else dict(decoder.signing.refused)),
         ("skipped ", dict(session.samples.skipped)),
         ("skipped ", dict(core.timeline.skipped)),
         ("skipped uwb ", dict(uwb.skipped)),
+        ("gps latency ", dict(core.gps_latency.counters)),
         ("refused ", dict(core.records.refused)),
         ("rejected uwb ", uwb.intake.rejections.as_dict()),
         ("rejected ", opener.peers.rejections()),
@@ -112,6 +114,8 @@ def gauges_of(core: AgentCore, session: AutopilotSession, now_s: float) -> dict[
         "rtt_s": session.clock.rtt_s,
         "gps_fix_type": float(session.samples.fix_type),
         "gps_age_s": core.gps_age_s(now_s),
+        "gps_latency_s": core.gps_latency.latency_s,
+        "gps_latency_sigma_s": core.gps_latency.sigma_s,
         **rates,
     }
     return {name: value for name, value in gauges.items() if value is not None and math.isfinite(value)}

@@ -5,10 +5,13 @@ AgentError
 ├── EndpointError      an address of a MAVLink link cannot be understood
 ├── LinkError          a MAVLink link cannot be opened (port taken, no such device)
 ├── NoAutopilotError   no autopilot appeared in time
-└── RecordError        a record cannot be written or read
+├── RecordError        a record cannot be written or read
+└── SecurityError      something that the security profile promises is missing
 """
 
 from __future__ import annotations
+
+from transport.errors import KeyFileError
 
 
 class AgentError(Exception):
@@ -43,3 +46,13 @@ class NoAutopilotError(AgentError):
 
 class RecordError(AgentError):
     """A record that cannot be written or read."""
+
+
+class SecurityError(AgentError, KeyFileError):
+    """Something that the security profile promises is missing; ``faults`` has a line for each."""
+
+    def __init__(self, profile: str, faults: tuple[str, ...]) -> None:
+        begin = f"security profile {profile}: "
+        super().__init__(begin + (faults[0] if len(faults) == 1 else "missing:\n- " + "\n- ".join(faults)))
+        self.profile = profile
+        self.faults = faults

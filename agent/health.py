@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from estimators.estimator import Status
@@ -12,6 +12,8 @@ MIN_IMU_COVERAGE = 0.9
 DEGRADED_SIGMA_M = 5.0
 FAULT_SIGMA_M = 50.0
 ALIGNED_SIGMA_M = 2.0
+DIRECTIONS = 3
+"""Neighbours, and directions to them, that hold a drone without GPS."""
 REPORT_PERIOD_S = 1.0
 """A state that flaps is reported no more often than this; what is reported is the latest."""
 
@@ -48,6 +50,12 @@ class Facts:
     """State of the autopilot's link."""
     waiting_for: str = ""
     """What the start waits for."""
+    located_neighbours: int = 0
+    """Neighbours whose place is known and which are ranged."""
+    directions: int = 0
+    """Directions of space (0..3) that the ranges to them hold: less than 3 where all lie in one plane with us."""
+    ambiguous: bool = False
+    """Whether the ranges leave more than one place."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,14 +64,35 @@ class Health:
 
     state: State
     reasons: tuple[str, ...]
+    alarm: bool = False
+    """Whether the own position may be wrong without the covariance saying so: without GPS, and not held by ranges."""
 
     def __str__(self) -> str:
-        return f"{self.state}: {'; '.join(self.reasons)}" if self.reasons else str(self.state)
+        state = f"ALARM, {self.state}" if self.alarm else str(self.state)
+        return f"{state}: {'; '.join(self.reasons)}" if self.reasons else state
 
 
 def assess(facts: Facts, was: State) -> Health:
     """The health that follows from facts; ``was`` the state before, since alignment is done once."""
-    missing = _missing(facts)
+    unheld = _unheld(facts)
+    health = _assess(facts, was, (*unheld, *_missing(facts)))
+    return replace(health, alarm=True) if unheld else health
+
+
+def _unheld(facts: Facts) -> tuple[str, ...]:
+    """Why the own position cannot be observed; empty if it can, or nothing is estimated yet."""
+    if facts.status is None or not _lost_gps(facts):
+        return ("not observable",) if facts.status is Status.NOT_OBSERVABLE else ()
+    if facts.ambiguous:
+        return ("not observable: the ranges leave more than one place",)
+    if facts.located_neighbours < DIRECTIONS:
+        return (f"not observable: ranges to {facts.located_neighbours} of {DIRECTIONS} located neighbours",)
+    if facts.directions < DIRECTIONS:
+        return ("not observable: all located neighbours in one plane",)
+    return ("not observable",) if facts.status is Status.NOT_OBSERVABLE else ()
+
+
+def _assess(facts: Facts, was: State, missing: tuple[str, ...]) -> Health:
     if facts.status is None:
         return Health(State.INIT, (facts.waiting_for, *missing) if facts.waiting_for else missing)
     if facts.own_sigma_m > FAULT_SIGMA_M and was not in (State.INIT, State.ALIGNING):
@@ -73,7 +102,7 @@ def assess(facts: Facts, was: State) -> Health:
     reasons = list(missing)
     if facts.own_sigma_m > DEGRADED_SIGMA_M:
         reasons.insert(0, "position uncertain")
-    if facts.status in (Status.FELL_BACK, Status.NOT_OBSERVABLE, Status.NO_DATA):
+    if facts.status in (Status.FELL_BACK, Status.NO_DATA):
         reasons.insert(0, f"estimate {facts.status.name.lower().replace('_', ' ')}")
     return Health(State.DEGRADED if reasons else State.OK, tuple(reasons))
 
@@ -84,11 +113,15 @@ def _missing(facts: Facts) -> tuple[str, ...]:
         reasons.append(f"autopilot {facts.autopilot}")
     if facts.imu_coverage < MIN_IMU_COVERAGE:
         reasons.append("IMU incomplete")
-    if facts.gps_age_s is None or facts.gps_age_s > GPS_LOST_S:
+    if _lost_gps(facts):
         reasons.append("no GPS")
     if facts.silent_neighbours:
         reasons.append(f"not heard: {', '.join(map(str, facts.silent_neighbours))}")
     return tuple(reasons)
+
+
+def _lost_gps(facts: Facts) -> bool:
+    return facts.gps_age_s is None or facts.gps_age_s > GPS_LOST_S
 
 
 class HealthMonitor:

@@ -10,6 +10,8 @@ from typing import Any
 
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from agent.mavlink_signing import LinkSigning
+
 __all__ = ["Decoder", "Encoder", "Message", "mavlink"]
 
 Message = Any
@@ -22,11 +24,13 @@ class Decoder:
     """Bytes of one remote endpoint to messages; bad bytes are counted, never raised.
 
     A datagram holds whole frames, so what a datagram leaves unparsed is dropped and counted: a stray 0xFD
-    cannot swallow the frames of the next one. A stream (serial, TCP) keeps it.
+    cannot swallow the frames of the next one. A stream (serial, TCP) keeps it. With ``signing`` only frames that
+    it accepts are good.
     """
 
-    def __init__(self, *, datagrams: bool) -> None:
+    def __init__(self, *, datagrams: bool, signing: LinkSigning | None = None) -> None:
         self._datagrams = datagrams
+        self.signing = signing
         self._parser = _parser()
         self._sequence: dict[tuple[int, int], int] = {}
         self.received = 0
@@ -35,6 +39,8 @@ class Decoder:
         """Messages missing by gaps in the senders' sequence numbers."""
         self.bad: Counter[str] = Counter()
         """Frames and stretches of bytes refused, by reason."""
+        self.frames: tuple[bytes, ...] = ()
+        """The good messages of the last `feed` as they came."""
 
     def feed(self, data: bytes) -> list[Message]:
         """The good messages in ``data``, and in what earlier calls left of a stream."""
@@ -44,9 +50,12 @@ class Decoder:
                 self.bad[_reason(message.reason)] += 1
             elif isinstance(message, mavlink.MAVLink_unknown):
                 self.bad["unknown message"] += 1  # its checksum could not be verified either
+            elif self.signing is not None and not self.signing.accepts(bytes(message.get_msgbuf())):
+                self.bad["not authentic"] += 1  # why is counted by `signing`
             else:
                 self._count(message)
                 good.append(message)
+        self.frames = tuple(bytes(message.get_msgbuf()) for message in good)
         self._trim()
         return good
 
@@ -84,9 +93,10 @@ def _reason(text: str) -> str:
 
 
 class Encoder:
-    """Messages of one component to MAVLink 2 frames, numbered in sequence."""
+    """Messages of one component to MAVLink 2 frames, numbered in sequence, and signed with ``signing``."""
 
-    def __init__(self, system_id: int, component_id: int) -> None:
+    def __init__(self, system_id: int, component_id: int, signing: LinkSigning | None = None) -> None:
+        self._signing = signing
         self._packer = mavlink.MAVLink(None, srcSystem=system_id, srcComponent=component_id)
         self.sent = 0
 
@@ -106,6 +116,8 @@ class Encoder:
 
     def encode(self, message: Message) -> bytes:
         """The message as one frame."""
+        if self._signing is not None:
+            self._signing.prepare(self._packer)
         frame = bytes(message.pack(self._packer))
         self._packer.seq = (self._packer.seq + 1) % 256
         self.sent += 1

@@ -12,6 +12,7 @@ from collections.abc import Callable
 
 from agent.config_tables import SensorsTable
 from agent.frames import FleetFrame, from_euler, normalised
+from agent.latency import Stamp, gps_prior, imu_latency_s
 from agent.mavlink_codec import Message, mavlink
 from agent.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Sample, Triple
 
@@ -47,8 +48,9 @@ class SampleAdapter:
         self._fleet_time_of_boot = fleet_time_of_boot
         self._last_preferred_s: dict[str, float] = {}
         self._last_fix: tuple[int, int, int, int] | None = None
-        self.ardupilot = False
-        """Set by the session once the autopilot is known: only ArduPilot scales RAW_IMU."""
+        self.flavour = "other"
+        """``ardupilot``, ``px4`` or ``other``, set by the owner once the autopilot is known: only ArduPilot scales
+        RAW_IMU, and the sensors of each are late in their own way."""
         self.fix_type = 0
         """The receiver's last word on its fix."""
         self.skipped: Counter[str] = Counter()
@@ -77,7 +79,7 @@ class SampleAdapter:
         return self._imu(message.time_usec, force, turn, arrival_s)
 
     def _raw_imu(self, message: Message, arrival_s: float) -> Sample | None:
-        if not self.ardupilot:
+        if self.flavour != "ardupilot":
             return self._skip("imu: RAW_IMU unscaled")
         if not self._is_second_choice_due("imu", arrival_s) or message.id:
             return None
@@ -95,7 +97,7 @@ class SampleAdapter:
         if max(map(abs, force)) > MAX_FORCE_MPS2 or max(map(abs, turn)) > MAX_TURN_RADPS:
             return self._skip("imu: out of range")
         t_s = self._stamp(time_usec, arrival_s, "imu")
-        return None if t_s is None else ImuSample(t_s - self._sensors.imu_latency_s, force, turn)
+        return None if t_s is None else ImuSample(t_s - imu_latency_s(self.flavour, self._sensors), force, turn)
 
     def _attitude_quaternion(self, message: Message, arrival_s: float) -> Sample | None:
         # repr_offset_q only serves displays of tailsitters; the attitude is q alone.
@@ -142,7 +144,7 @@ class SampleAdapter:
             return None
         ground, norm = self._speeds(message)
         return GpsSample(
-            t_s=t_s - self._sensors.gps_latency_s,
+            t_s=t_s,
             position_m=self._frame.ned(message.lat * 1e-7, message.lon * 1e-7, height),
             horizontal_sigma_m=horizontal,
             vertical_sigma_m=1.5 * horizontal if vertical is None else vertical,
@@ -150,6 +152,7 @@ class SampleAdapter:
             speed_mps=norm,
             speed_sigma_mps=message.vel_acc * 1e-3 or self._sensors.gps_speed_sigma_mps,
             fix_type=message.fix_type,
+            latency=gps_prior(self.flavour, _stamp_kind(message.time_usec), self._sensors),
         )
 
     def _accuracy_m(self, accuracy_mm: int, dilution_centi: int) -> float | None:
@@ -209,6 +212,12 @@ class SampleAdapter:
     def _skip(self, reason: str) -> Sample | None:
         self.skipped[reason] += 1
         return None
+
+
+def _stamp_kind(time_usec: int) -> Stamp:
+    if not time_usec:
+        return "arrival"
+    return "utc" if time_usec > UNIX_US else "boot"
 
 
 def _finite(*values: float) -> bool:

@@ -1,4 +1,7 @@
-"""The daemon's side of the transport: seals and opens packets, injects configured faults, watches presence."""
+"""The daemon's side of the transport: seals packets, injects configured faults, watches presence.
+
+Packets are handed on as they came, decrypted where the fleet encrypts; `agent.onboard` opens them.
+"""
 
 from __future__ import annotations
 
@@ -10,26 +13,21 @@ from collections.abc import Callable
 from pathlib import Path
 
 from agent.config_tables import FleetConfig
-from transport.auth import UNSIGNED, Signing, Trust
+from agent.radio_faults import channel_settings
+from agent.security import agent_session, credentials, expiry_warnings, new_salt
 from transport.channel import Channel, ChannelSettings
-from transport.clock_body import (
-    ClockAnswer,
-    decode_clock_question,
-    encode_clock_question,
-)
-from transport.errors import EncodeError, Rejected
+from transport.clock_body import ClockAnswer, decode_clock_question, encode_clock_question
+from transport.errors import EncodeError, Rejected, RejectionCounter
 from transport.information_body import Information
-from transport.keys import load_secret, load_trust, next_boot
-from transport.opening import Opener, Received
-from transport.sealing import Message, Sealer
+from transport.sealing import Message, Packet, Sealer
 from transport.session import Handlers, Session, open_session
-from transport.session_settings import SessionSettings
 from transport.streams import Stream, key_expression, parse_key
 
 LOG = logging.getLogger("fleetloc.agent")
 USED_STREAMS = (Stream.MEAS, Stream.INFO)
 
-OnReceived = Callable[[Received], None]
+OnPacket = Callable[[str, bytes, float, int], None]
+"""(key expression, packet, arrival on the monotonic clock in s, UTC in ns that it is to be judged by)."""
 OnUwb = Callable[[bytes, float], None]
 """(payload, arrival on the monotonic clock in s)."""
 OnGone = Callable[[int], None]
@@ -38,7 +36,7 @@ OnGone = Callable[[int], None]
 class Radio:
     """One agent's session with its neighbours; open it once, close it once.
 
-    Ages and deadlines here are on the monotonic clock; ``opener`` holds what is known of each peer's link.
+    ``trust`` holds the neighbours' public keys.
     """
 
     def __init__(
@@ -46,50 +44,53 @@ class Radio:
         config: FleetConfig,
         agent_id: int,
         base: Path,
-        on_received: OnReceived,
+        on_packet: OnPacket,
         on_uwb: OnUwb,
         on_gone: OnGone,
     ) -> None:
-        """Read the keys and take the next start number; raises `KeyFileError`, `SettingsError`."""
+        """Read the keys and take the next start number; raises `SecurityError`, `KeyFileError`, `SettingsError`."""
         self._config = config
         self._agent_id = agent_id
         self._fleet = config.fleet.name
         self._neighbours = config.neighbours(agent_id)
-        self._on_received, self._on_uwb, self._on_gone = on_received, on_uwb, on_gone
-        signing, trust, boot = _credentials(config, agent_id, base)
-        self._sealer = Sealer(self._fleet, agent_id, boot=boot, signing=signing)
-        self.opener = Opener(self._fleet, config.ids, trust, own_id=agent_id, freshness_s=config.security.freshness_s)
+        self._on_packet, self._on_uwb, self._on_gone = on_packet, on_uwb, on_gone
+        own = credentials(config, agent_id, base, unix_s=time.time(), salt=new_salt())
+        for warning in expiry_warnings(config, agent_id, base, unix_s=time.time()):
+            LOG.warning("agent %d: %s", agent_id, warning)
+        self.trust, self._envelopes = own.trust, own.envelopes
+        self._settings = agent_session(config, agent_id, base)
+        self._sealer = Sealer(self._fleet, agent_id, boot=own.boot, signing=own.signing)
+        self._channel: Channel[tuple[str, bytes, float]] = Channel.seeded(
+            self._faults(None), seed=config.transport.seed, receiver=agent_id, neighbours=self._neighbours
+        )
+        self._flying = False
+        self._heard_s: dict[int, float] = {}
+        self._redeclared = 0
         transport = config.transport
-        faults = ChannelSettings(
-            loss=transport.loss,
-            delay_s=transport.delay_s,
-            delay_exponential_s=transport.delay_jitter_s,
-        )
-        self._channel: Channel[tuple[str, bytes]] = Channel.seeded(
-            faults, seed=transport.seed, receiver=agent_id, neighbours=self._neighbours
-        )
         self._double = {"auto": None, "float32": False, "float64": True}[transport.information_format]
         self._timer: asyncio.TimerHandle | None = None
+        self._repair: asyncio.TimerHandle | None = None
         self._session: Session | None = None
         self._unsent: Counter[str] = Counter()
+        self._rejections = RejectionCounter()
 
     async def open(self) -> None:
         """Open the session, listen to the neighbours, then show that we are there; raises `SessionError`."""
-        settings = SessionSettings(
-            listen=self._config.listen(self._agent_id), connect=self._config.connect(self._agent_id)
-        )
         handlers = Handlers(self._on_sample, self._on_presence, self._on_clock_question)
-        session = await open_session(settings, self._fleet, self._agent_id, self._config.ids, handlers)
+        session = await open_session(self._settings, self._fleet, self._agent_id, self._config.ids, handlers)
+        self._heard_s = dict.fromkeys(self._neighbours, time.monotonic())
         session.subscribe(self._agent_id, (Stream.UWB,))
         for neighbour in self._neighbours:
             session.subscribe(neighbour, USED_STREAMS)
         session.announce()
         self._session = session
+        self._repair_later()
 
     async def close(self) -> None:
         """Leave; neighbours see it at once."""
-        if self._timer is not None:
-            self._timer.cancel()
+        for timer in (self._timer, self._repair):
+            if timer is not None:
+                timer.cancel()
         if self._session is not None:
             await self._session.close()
 
@@ -99,7 +100,7 @@ class Radio:
             return
         try:
             double = self._double if isinstance(message, Information) else None
-            packets = self._sealer.seal(message, t_ns=time.time_ns(), double=double)
+            packets = self._sealed(message, time.time_ns(), double)
         except EncodeError as error:
             self._unsent[type(message).__name__] += 1
             LOG.debug("agent %d: not sent: %s", self._agent_id, error)
@@ -107,9 +108,15 @@ class Radio:
         for packet in packets:
             self._session.publish(packet.stream, packet.data)
 
-    def expire(self, now_s: float) -> None:
-        """Give up what is incomplete for too long; ``now_s`` monotonic. Call it once in a while."""
-        self.opener.expire(now_s)
+    def _sealed(self, message: Message, t_ns: int, double: bool | None = None) -> list[Packet]:
+        packets = self._sealer.seal(message, t_ns=t_ns, double=double)
+        if self._envelopes is None:
+            return packets
+        keys = (key_expression(self._fleet, self._agent_id, packet.stream) for packet in packets)
+        return [
+            Packet(packet.stream, self._envelopes.close(key, packet.data))
+            for key, packet in zip(keys, packets, strict=True)
+        ]
 
     def counters(self) -> dict[str, int]:
         """What this side counts."""
@@ -120,7 +127,8 @@ class Radio:
             "packets shed": session.shed if session else 0,
             "records left out": self._sealer.left_out,
             "injected losses": sum(self._channel.lost.values()),
-        }
+            "subscriptions repeated": self._redeclared,
+        } | {f"rejected {reason}": count for reason, count in self._rejections.as_dict().items()}
 
     async def ask_clocks(self) -> None:
         """Measure the offset of each neighbour's clock once."""
@@ -133,9 +141,7 @@ class Radio:
             return
         packet, arrived_ns = answer
         key = key_expression(self._fleet, agent_id, Stream.CLOCK)
-        received = self.opener.open(key, packet, now=time.monotonic(), unix_ns=arrived_ns)
-        if received is not None and isinstance(received.message, ClockAnswer):
-            self.opener.peers[agent_id].clock.add(received.message, arrived_ns)
+        self._hand_on(key, packet, time.monotonic(), arrived_ns)
 
     def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
         try:
@@ -146,7 +152,7 @@ class Radio:
         now_ns = time.time_ns()
         # Our UTC clock may be set back while we answer; an answer may not come before its question.
         answer = ClockAnswer(asked_ns, arrived_ns, max(now_ns, arrived_ns))
-        return self._sealer.seal(answer, t_ns=now_ns)[0].data
+        return self._sealed(answer, now_ns)[0].data
 
     def _on_sample(self, key: str, payload: bytes, arrived_s: float) -> None:
         parsed = parse_key(key)
@@ -156,16 +162,49 @@ class Radio:
         if stream is Stream.UWB:
             self._on_uwb(payload, arrived_s)
             return
-        self._channel.offer(sender, (key, payload), arrived_s)
+        self._heard_s[sender] = arrived_s
+        self._channel.offer(sender, (key, payload, arrived_s), arrived_s)
         self._deliver()
+
+    def begin_flight(self, host_s: float) -> None:
+        """The autopilot was heard: from the first such instant on count the times of injected outages."""
+        if not self._flying:
+            self._channel.change(self._faults(host_s))
+        self._flying = True
+
+    def _faults(self, began_s: float | None) -> ChannelSettings:
+        transport = self._config.transport
+        return channel_settings(
+            transport.faults,
+            self._agent_id,
+            loss=transport.loss,
+            delay_s=transport.delay_s,
+            delay_jitter_s=transport.delay_jitter_s,
+            began_s=began_s,
+        )
+
+    def _repair_later(self) -> None:
+        after_s = self._config.transport.redeclare_after_s
+        self._repair = asyncio.get_running_loop().call_later(after_s, self._redeclare)
+
+    def _redeclare(self) -> None:
+        """Tell silent neighbours again what we listen to.
+
+        Zenoh tells a neighbour once per link, and a datagram that is lost is not repeated: it would send us nothing
+        as long as the link lives.
+        """
+        latest_s = time.monotonic() - self._config.transport.redeclare_after_s
+        for neighbour, heard_s in self._heard_s.items():
+            if self._session is not None and heard_s < latest_s:
+                self._session.resubscribe(neighbour)
+                self._redeclared += 1
+        self._repair_later()
 
     def _deliver(self) -> None:
         """Hand on what the channel lets through by now, and come back for what it delays."""
         now_s = time.monotonic()
-        for _, (key, payload) in self._channel.due(now_s):
-            received = self.opener.open(key, payload, now=now_s, unix_ns=time.time_ns())
-            if received is not None:
-                self._on_received(received)
+        for _, (key, payload, arrived_s) in self._channel.due(now_s):
+            self._hand_on(key, payload, arrived_s, time.time_ns())
         if self._timer is not None:
             self._timer.cancel()
             self._timer = None
@@ -173,17 +212,17 @@ class Radio:
         if due_s is not None:
             self._timer = asyncio.get_running_loop().call_at(due_s, self._deliver)
 
+    def _hand_on(self, key: str, payload: bytes, arrived_s: float, unix_ns: int) -> None:
+        if self._envelopes is not None:
+            try:
+                payload = self._envelopes.open(key, payload)
+            except Rejected as rejected:
+                self._rejections.count(rejected.reason)
+                LOG.debug("agent %d: %s", self._agent_id, rejected)
+                return
+        self._on_packet(key, payload, arrived_s, unix_ns)
+
     def _on_presence(self, agent_id: int, alive: bool) -> None:
         if agent_id in self._neighbours and not alive:
             LOG.info("agent %d: neighbour %d has left", self._agent_id, agent_id)
             self._on_gone(agent_id)
-
-
-def _credentials(config: FleetConfig, agent_id: int, base: Path) -> tuple[Signing, Trust, int]:
-    """What to sign with, whom to trust, and the number of this start."""
-    if config.security.mode == "unsigned":
-        return UNSIGNED, UNSIGNED, int(time.time())
-    directory = base / config.security.keys
-    secret = load_secret(directory, agent_id)
-    trust = load_trust(directory, config.ids)
-    return secret, trust, next_boot(directory / f"agent_{agent_id:03d}.boot", time.time())

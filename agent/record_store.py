@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
+from collections.abc import Callable, Container, Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +16,9 @@ from estimators.measurements import INPUT, ROW, InputTable, RowTable
 from transport.errors import EncodeError
 from transport.measurement_body import AccelerationRecord, Measurements, Record, as_sent, identity
 
+_Entry = tuple[int, RowTable]
+"""(tick, rows or input of one record)."""
+
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
 AHEAD_TICKS = 2
@@ -21,35 +26,57 @@ AHEAD_TICKS = 2
 
 
 class Neighbourhood:
-    """Who is how many hops away, and what that means for records."""
+    """Who is how many hops away, and what that means for records.
+
+    With configured edges the hops are those of the graph. Without, neighbours are who is heard: one hop for a drone
+    that was heard directly of late, two for all others (a record does not say how far it came).
+    """
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
         self._settings = config.estimator
-        self.hops = {agent_id: 0}
-        """Hops from this agent to each other that can be reached."""
+        self._size = len(config.ids)
+        self._recent_ticks = math.ceil(config.transport.neighbour_timeout_s / config.fleet.period_s)
+        self._heard: dict[int, int] = {}
+        self._tick = 0
+        self._graph = {agent_id: 0}
+        """Hops along the configured edges to each agent that can be reached."""
+        self._by_reach = config.fleet.edges is None
+        self._agent_id = agent_id
         frontier, distance = [agent_id], 0
         while frontier:
             distance += 1
             reached = dict.fromkeys(n for one in frontier for n in config.neighbours(one))
-            frontier = [n for n in reached if n not in self.hops]
-            self.hops |= dict.fromkeys(frontier, distance)
+            frontier = [n for n in reached if n not in self._graph]
+            self._graph |= dict.fromkeys(frontier, distance)
+
+    def hear(self, agent_id: int, tick: int) -> None:
+        """A packet came directly from an agent."""
+        self._heard[agent_id] = tick
+        self._tick = max(self._tick, tick)
+
+    def hops(self, agent_id: int) -> int | None:
+        """Hops to an agent; ``None`` if no edges lead there."""
+        if not self._by_reach or agent_id == self._agent_id:
+            return self._graph.get(agent_id)
+        heard = self._heard.get(agent_id)
+        return 1 if heard is not None and self._tick - heard <= self._recent_ticks else 2
 
     def uses(self, record: Record) -> bool:
         """Whether this agent's estimator takes the record."""
-        hops = self.hops.get(record.observer)
+        hops = self.hops(record.observer)
         if hops is None:
             return False
         if isinstance(record, AccelerationRecord):
-            reach = {"none": 0, "neighbours": 1, "fleet": len(self.hops)}[self._settings.share_inputs]
-            return hops <= reach
+            return hops <= {"none": 0, "neighbours": 1, "fleet": self._size}[self._settings.share_inputs]
         return hops <= 1 + self._settings.relay_hops
 
     def sends(self, record: Record) -> bool:
         """Whether this agent tells its neighbours: its own records, and others' that are relayed so far."""
-        hops = self.hops[record.observer]
+        hops = self.hops(record.observer)
+        if hops is None:
+            return False
         if isinstance(record, AccelerationRecord):
-            reach = {"none": -1, "neighbours": 0, "fleet": len(self.hops)}[self._settings.share_inputs]
-            return hops <= reach
+            return hops <= {"none": -1, "neighbours": 0, "fleet": self._size}[self._settings.share_inputs]
         return hops <= self._settings.relay_hops
 
 
@@ -60,11 +87,12 @@ class RecordStore:
         self._agent_id = agent_id
         self._layout = Layout(config.ids)
         self._history_ticks = config.transport.history_ticks
+        self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
         self._seen: dict[int, set[object]] = {}
         self._to_send: dict[int, list[Record]] = {}
-        self._rows: list[tuple[int, RowTable]] = []
-        self._inputs: list[tuple[int, InputTable]] = []
+        self._rows: list[_Entry] = []
+        self._inputs: list[_Entry] = []
         self.refused: Counter[str] = Counter()
 
     def add_own(self, record: Record) -> Record | None:
@@ -91,16 +119,40 @@ class RecordStore:
             return False
         return self._add(record)
 
-    def take(self, tick: int) -> tuple[RowTable, InputTable]:
-        """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old."""
-        rows = [table for row_tick, table in self._rows if row_tick <= tick]
-        inputs = [table for input_tick, table in self._inputs if input_tick < tick]
-        self._rows = [entry for entry in self._rows if entry[0] > tick]
-        self._inputs = [entry for entry in self._inputs if entry[0] >= tick]
+    def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
+        """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
+
+        Slots are those of ``members``. Rows wait for the agents that they name to be ``located``, inputs for theirs
+        to be a member, as long as an estimator's window could still use them.
+        """
+        slots = np.full(self._layout.size + 1, -1, np.int32)  # the last stays for "no other end"
+        usable = np.zeros(self._layout.size + 1, np.bool_)
+        usable[-1] = True
+        for slot, agent in enumerate(members):
+            slots[self._layout.slot(agent)] = slot
+            usable[self._layout.slot(agent)] = agent in located
+        rows, self._rows = _parted(
+            self._rows, lambda at, row: at <= tick and bool(usable[row["agent"]] and usable[row["other"]])
+        )
+        inputs, self._inputs = _parted(self._inputs, lambda at, row: at < tick and bool(slots[row["agent"]] >= 0))
+        self.forget(tick)
+        joined, pushes = _joined(rows, ROW), _joined(inputs, INPUT)
+        for field in ("agent", "other", "observer"):
+            joined[field] = slots[joined[field]]
+        pushes["agent"] = slots[pushes["agent"]]
+        return joined, pushes
+
+    def forget(self, tick: int) -> None:
+        """Let go what no window that ends at a tick or later could use."""
+        first = tick - self._hold_ticks
+        late = sum(at < first for at, _ in self._rows)
+        if late:
+            self.refused["not located"] += late
+        self._rows = [entry for entry in self._rows if entry[0] >= first]
+        self._inputs = [entry for entry in self._inputs if entry[0] >= first]
         for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
             del self._seen[old]
             self._to_send.pop(old, None)
-        return _joined(rows, ROW), _joined(inputs, INPUT)
 
     def packet(self, tick: int) -> Measurements:
         """What neighbours get at a tick: the records of the last ticks, our own before relayed ones."""
@@ -121,8 +173,21 @@ class RecordStore:
         if isinstance(record, AccelerationRecord):
             self._inputs.append((record.tick, input_of(record, self._layout)))
         else:
-            self._rows.append((record.tick, rows_of(record, self._layout)))
+            rows = rows_of(record, self._layout)
+            if len(rows):
+                self._rows.append((record.tick, rows))
         return True
+
+
+def _parted(entries: list[_Entry], wanted: Callable[[int, np.void], bool]) -> tuple[list[RowTable], list[_Entry]]:
+    """The tables that are wanted by their tick and first row (all rows of a record name the same), and the rest."""
+    taken, left = [], []
+    for at, table in entries:
+        if wanted(at, table[0]):
+            taken.append(table)
+        else:
+            left.append((at, table))
+    return taken, left
 
 
 def _joined(tables: list[RowTable], dtype: np.dtype[Any]) -> RowTable:

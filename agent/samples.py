@@ -31,9 +31,26 @@ class AttitudeSample:
 
 
 @dataclass(frozen=True, slots=True)
+class LatencyPrior:
+    """How much older than its stamp a sample's value is, as far as it is known beforehand.
+
+    ``source`` names autopilot and stamp; what is learned of the latency holds for samples of an equal prior.
+    ``sigma_s`` is its 1-sigma, 0 = exactly known.
+    """
+
+    source: str
+    latency_s: float
+    sigma_s: float
+
+
+NO_LATENCY = LatencyPrior("exact", 0.0, 0.0)
+
+
+@dataclass(frozen=True, slots=True)
 class GpsSample:
     """A fix, with what the receiver says of its own accuracy (1-sigma per axis).
 
+    ``t_s`` is what its stamp says; the value is older by ``latency`` (`agent.latency.gps_prior`).
     ``ground_velocity_mps`` (north, east) or ``speed_mps`` (norm of the velocity), whichever the receiver
     gives; ``fix_type`` as in MAVLink (3 = 3-D).
     """
@@ -46,6 +63,7 @@ class GpsSample:
     speed_mps: float | None
     speed_sigma_mps: float
     fix_type: int
+    latency: LatencyPrior = NO_LATENCY
 
 
 @dataclass(frozen=True, slots=True)

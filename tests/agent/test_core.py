@@ -57,6 +57,7 @@ class Notebook:
 
     def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         self.calls.append(("mix", round_, tuple(received)))
+        self.mixed = dict(received)
         self.fail("mix", self.tick)
 
     def solve(self, budget: int | None = None) -> Estimate:
@@ -268,16 +269,33 @@ def test_information_is_mixed_by_slot_in_its_round_and_late_counted(make_config:
     assert core.counters["information: late"] >= 1
 
 
-def test_information_about_another_fleet_or_window_is_left_out(make_config: MakeConfig) -> None:
+def test_information_about_another_window_is_left_out(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
     core.advance(100.0)
-    core.on_packet(received(2, information(1000, agents=(2, 1))), 100.1)
-    core.on_packet(received(2, Measurements(1000, ())), 100.1)
     core.on_packet(received(2, information(1000, state_tick=998)), 100.1)
+    core.on_packet(received(2, Measurements(1000, ())), 100.1)
     core.advance(100.115)
     assert made[0].calls[-1] == ("mix", 0, ())
-    assert core.counters["information: other agents"] == 1
     assert core.counters["information: other window"] == 1
+
+
+@pytest.mark.parametrize("agents", [(2, 1), (2,), (2, 3), (3, 2, 1)])
+def test_information_about_other_members_is_mapped_and_used_once(
+    make_config: MakeConfig, agents: tuple[int, ...]
+) -> None:
+    # GIVEN a neighbour that sees another fleet than we do, WHEN its pair comes twice
+    core, made = lone(make_config, "estimator.kind=dmhe_relay", count=2)
+    core.advance(100.0)
+    for _ in range(2):
+        core.on_packet(received(2, information(1000, agents=agents)), 100.1)
+    core.on_packet(received(2, Measurements(1000, ())), 100.1)
+    core.advance(100.115)
+    # THEN the estimator gets it once, in its own layout
+    assert made[0].calls[-1] == ("mix", 0, (1,))
+    assert made[0].mixed[1].information.shape == (12, 12)
+    assert made[0].mixed[1].information[6:, 6:] == pytest.approx(np.eye(6))
+    assert core.counters["information: other members"] == 1
+    assert core.counters["information: duplicate"] == 1
 
 
 def test_strangers_are_not_listened_to(make_config: MakeConfig) -> None:
@@ -351,14 +369,21 @@ def test_a_drone_without_gps_lives_on_its_neighbours(virtual_fleet: Fleet, make_
     assert fleet.health[1][-1] == "ok"
 
 
-def test_a_drone_that_never_had_gps_starts_from_its_neighbours(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
-    config = make_config(4, "initial.max_wait_s=2.0")
-    fleet = virtual_fleet(config, blind=lambda agent_id, t_s: agent_id == 4)
-    fleet.run(10)
-    statuses = [r.estimate.status for r in fleet.estimates[4]]
+def test_a_drone_that_never_had_gps_says_so_until_its_ranges_leave_one_place(
+    virtual_fleet: Fleet, make_config: MakeConfig
+) -> None:
+    config = make_config(5, "initial.max_wait_s=2.0", "estimator.kind=dmhe_relay", "estimator.window=4")
+    fleet = virtual_fleet(config, blind=lambda agent_id, t_s: agent_id == 5)
+    fleet.run(9)
+    statuses = [r.estimate.status for r in fleet.estimates[5]]
     assert statuses[0] is Status.NO_DATA
     assert 15 <= statuses.count(Status.NO_DATA) <= 25
-    assert np.median(fleet.own_error_m(4)[70:]) < 2.0
+    assert Status.NOT_OBSERVABLE in statuses
+    located = len(statuses) - next(k for k, s in enumerate(reversed(statuses)) if s is Status.NOT_OBSERVABLE)
+    assert located < 60
+    assert set(statuses[located:]) == {Status.OK}
+    assert fleet.own_error_m(5)[located + 5 :].max() < 1.0
+    assert fleet.health[5][-1] == "degraded: no GPS"
 
 
 def test_a_dead_neighbour_costs_no_tick_and_is_taken_back(virtual_fleet: Fleet, make_config: MakeConfig) -> None:

@@ -23,10 +23,18 @@ from agent.daemon import Daemon, run
 from agent.exit_codes import ExitCode
 from agent.logs import configure_logging
 from agent.mavlink_codec import Encoder, mavlink
+from agent.observers import DaemonState, Observer
 from agent.recording import read_record
 from estimators.estimator import Status
 from estimators.factory import make_estimator
+from transport.auth import UNSIGNED
+from transport.estimate_body import FleetEstimate
 from transport.keys import init_keys
+from transport.opening import Opener
+from transport.report_body import Diagnostics
+from transport.session import Handlers, open_session
+from transport.session_settings import SessionSettings
+from transport.streams import Stream
 
 HOST = "127.0.0.1"
 PATIENCE_S = 30.0
@@ -185,7 +193,7 @@ async def test_two_daemons_find_their_autopilots_and_each_other(
     runs = [asyncio.create_task(daemon.run()) for daemon in daemons]
     await until(lambda: all(d.core.health.health.state == "ok" for d in daemons), "both ok")
     await until(lambda: all(d.core.counters["information: kept"] > 5 for d in daemons), "rounds of both")
-    await until(lambda: bool(daemons[0].radio.opener.peers[2].clock.round_trip_s), "a clock answer")
+    await until(lambda: bool(daemons[0].onboard.opener.peers[2].clock.round_trip_s), "a clock answer")
     daemons[1].stop()
     await asyncio.wait_for(runs[1], PATIENCE_S)
     await until(lambda: "not heard: 2" in str(daemons[0].core.health.health), "2 has left")
@@ -206,18 +214,78 @@ async def test_a_stranger_on_the_mavlink_port_gets_none_of_the_autopilots_frames
     config = config_of(1, "security.mode=unsigned")
     daemon = Daemon(config, 1, make_estimator, Path())
     running = asyncio.create_task(daemon.run())
-    await until(lambda: daemon.summary()["counters"]["mavlink opened"] == 1, "the open link")
+    await until(lambda: daemon.state().counters["mavlink opened"] == 1, "the open link")
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as stranger:
         stranger.setblocking(False)
         beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
         address = config.agent(1).mavlink.removeprefix("udpin:").split(":")
         stranger.sendto(Encoder(77, 1).encode(beat), (address[0], int(address[1])))
-        await until(lambda: daemon.summary()["counters"].get("mavlink ignored heartbeat: other system") == 1, "it")
-        sent = daemon.summary()["counters"]["mavlink tx dropped"]
+        await until(lambda: daemon.state().counters.get("mavlink ignored heartbeat: other system") == 1, "it")
+        sent = daemon.state().counters["mavlink tx dropped"]
         # THEN our heartbeats still are for nobody, until the autopilot speaks
-        await until(lambda: daemon.summary()["counters"]["mavlink tx dropped"] > sent, "a heartbeat for nobody")
+        await until(lambda: daemon.state().counters["mavlink tx dropped"] > sent, "a heartbeat for nobody")
         with pytest.raises(BlockingIOError):
             stranger.recv(512)
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+
+
+class Watching(Observer):
+    """Counts what it is told; raises at every estimate if it is to."""
+
+    def __init__(self, fails: bool) -> None:
+        self.fails, self.estimates, self.ended = fails, 0, False
+        self.states: list[DaemonState] = []
+
+    def on_estimate(self, ready: Any, published_s: float, tick_time_s: float) -> None:
+        self.estimates += 1
+        if self.fails:
+            raise RuntimeError("no metrics today")
+
+    def on_second(self, state: DaemonState) -> None:
+        self.states.append(state)
+
+    async def close(self, state: DaemonState) -> None:
+        self.ended = True
+        if self.fails:
+            raise RuntimeError("no end either")
+
+
+async def test_observers_are_told_and_cannot_hurt(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
+    # GIVEN a daemon with an observer that fails and one that does not
+    failing, good = Watching(True), Watching(False)
+    daemon = Daemon(config_of(1, "security.mode=unsigned"), 1, make_estimator, Path(), (failing, good))
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: good.estimates > 5 and len(good.states) > 0, "estimates and a second")
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    # THEN both were told, the fault is counted and said, and the daemon went on to its end
+    assert abs(failing.estimates - good.estimates) <= 1
+    assert good.ended
+    assert good.states[-1].counters["program faults"] > 0
+    assert "no metrics today" in caplog.text
+    assert "no end either" in caplog.text
+    summary = json.loads(next(Path(str(daemon._config.record.directory)).glob("*.json")).read_text())
+    assert summary["counters"]["record entries"] > 0
+
+
+async def test_estimates_and_diagnostics_are_there_for_a_monitor(config_of: Any) -> None:
+    config = config_of(1, "security.mode=unsigned")
+    daemon = Daemon(config, 1, make_estimator, Path())
+    running = asyncio.create_task(daemon.run())
+    opener, seen = Opener(config.fleet.name, config.ids, UNSIGNED), set()
+
+    def on_sample(key: str, payload: bytes, arrived_s: float) -> None:
+        received = opener.open(key, payload, now=arrived_s, unix_ns=time.time_ns())
+        assert received is not None
+        seen.add(type(received.message))
+
+    settings = SessionSettings(connect=config.listen(1))
+    session = await open_session(settings, config.fleet.name, None, config.ids, Handlers(on_sample))
+    session.subscribe(1, (Stream.EST, Stream.DIAG))
+    session.announce()
+    await until(lambda: seen == {FleetEstimate, Diagnostics}, "both streams")
+    await session.close()
     daemon.stop()
     await asyncio.wait_for(running, PATIENCE_S)
 

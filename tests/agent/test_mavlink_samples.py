@@ -24,7 +24,7 @@ BOOT_OFFSET_S = 400.0
 
 def adapter(ardupilot: bool = False, **sensors: Any) -> SampleAdapter:
     made = SampleAdapter(FRAME, SensorsTable(**sensors), EPOCH_UNIX_S, lambda boot_s, _: boot_s + BOOT_OFFSET_S)
-    made.ardupilot = ardupilot
+    made.flavour = "ardupilot" if ardupilot else "px4"
     return made
 
 
@@ -170,11 +170,11 @@ def test_a_fix_sent_again_is_used_once() -> None:
 
 
 def test_gps_time_zero_is_arrival_and_unix_time_is_understood() -> None:
-    made = adapter(gps_latency_s=0.15)
-    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S - 0.15)
-    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S - 0.15)  # time 0 is no identity
+    made = adapter()
+    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S)
+    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S)  # time 0 is no identity
     unix = round((EPOCH_UNIX_S + 499.5) * 1e6)
-    assert convert(made, gps(time_usec=unix)).t_s == pytest.approx(499.35, abs=1e-5)
+    assert convert(made, gps(time_usec=unix)).t_s == pytest.approx(499.5, abs=1e-5)
 
 
 def test_heights_follow_the_fleets_origin() -> None:

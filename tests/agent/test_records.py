@@ -96,35 +96,42 @@ def line(make_config: Callable[..., FleetConfig], count: int = 4, *overrides: st
     return make_config(count, f"fleet.edges={edges}", *overrides)
 
 
+IDS = (1, 2, 3)
+"""All agents of a small fleet, located."""
+
+
 def test_each_record_is_handed_out_once_and_inputs_only_when_they_have_acted(
     make_config: Callable[..., FleetConfig],
 ) -> None:
     store = RecordStore(make_config(), 1)
+    store.neighbourhood.hear(2, 5)
     for _ in range(3):
         store.add_own(position(1, 5))
         store.add_heard(position(2, 5), 5)
         store.add_heard(acceleration(2, 5), 5)
         store.add_heard(position(2, 6), 5)
-    rows, inputs = store.take(5)
+    rows, inputs = store.take(5, IDS, IDS)
     assert (sorted(rows["agent"].tolist()), len(inputs)) == ([0, 0, 0, 1, 1, 1], 0)
-    rows, inputs = store.take(6)
+    rows, inputs = store.take(6, IDS, IDS)
     assert (rows["tick"].tolist(), inputs["tick"].tolist()) == ([6] * 3, [5])
-    assert len(store.take(7)[0]) == 0
+    assert len(store.take(7, IDS, IDS)[0]) == 0
     store.add_heard(position(2, 5), 7)
-    assert len(store.take(8)[0]) == 0
+    assert len(store.take(8, IDS, IDS)[0]) == 0
 
 
 def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig]) -> None:
     store = RecordStore(make_config(), 1)
-    store.take(20)
+    store.neighbourhood.hear(2, 20)
+    store.take(20, IDS, IDS)
     store.add_heard(position(2, 18, offset_s=0.04), 20)
-    rows, _ = store.take(21)
+    rows, _ = store.take(21, IDS, IDS)
     assert rows["tick"].tolist() == [18] * 3
     assert rows["offset_s"] == pytest.approx([0.04] * 3)
 
 
 def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[..., FleetConfig]) -> None:
     store = RecordStore(make_config(), 1)
+    store.neighbourhood.hear(2, 100)
     assert not store.add_heard(position(2, 100 - 65), 100)
     assert not store.add_heard(position(2, 103), 100)
     assert not store.add_heard(position(1, 100), 100)
@@ -163,11 +170,11 @@ def test_whose_records_are_used_follows_hops_and_sharing(
 ) -> None:
     config = line(make_config, 5, f"estimator.relay_hops={relay_hops}", f"estimator.share_inputs={share}")
     hood = RecordStore(config, 2).neighbourhood
-    assert hood.hops == {1: 1, 2: 0, 3: 1, 4: 2, 5: 3}
+    assert [hood.hops(i) for i in range(1, 6)] == [1, 0, 1, 2, 3]
     assert [i for i in range(1, 6) if hood.uses(position(i, 1))] == positions
     assert [i for i in range(1, 6) if hood.uses(acceleration(i, 1))] == accelerations
     assert [i for i in range(1, 6) if hood.sends(position(i, 1))] == [
-        i for i in range(1, 6) if hood.hops[i] <= relay_hops
+        i for i in range(1, 6) if (hood.hops(i) or 0) <= relay_hops
     ]
 
 
@@ -176,7 +183,7 @@ def test_our_own_numbers_are_those_that_others_get(make_config: Callable[..., Fl
     rounded = store.add_own(position(1, 5, north_m=1 / 3))
     assert isinstance(rounded, PositionRecord)
     assert rounded.position_m[0] == float(np.float32(1 / 3))
-    assert store.take(5)[0]["value"][0] == rounded.position_m[0]
+    assert store.take(5, IDS, IDS)[0]["value"][0] == rounded.position_m[0]
     assert store.add_own(position(1, 6, north_m=1e7)) is None
     assert store.refused["own: out of range"] == 1
 
@@ -194,6 +201,41 @@ def test_memory_stays_bounded(make_config: Callable[..., FleetConfig]) -> None:
         store.add_own(position(1, tick))
         store.add_heard(RangeRecord(2, tick, 3, 4.0, 0.1), tick)
         store.add_heard(VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi)), tick)
-        store.take(tick)
+        store.take(tick, IDS, IDS)
     assert len(store._seen) <= 66
     assert len(store._to_send) <= 66
+
+
+def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_the_members(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    # GIVEN a fix of 3 and ranges 1-3 and 1-2, WHEN 2 is no member and 3 is not located yet
+    store = RecordStore(make_config(3, "estimator.window=4"), 1)
+    store.neighbourhood.hear(3, 10)
+    store.add_heard(position(3, 10), 10)
+    store.add_own(RangeRecord(1, 10, 3, 4.0, 0.1))
+    store.add_own(RangeRecord(1, 10, 2, 5.0, 0.1))
+    store.add_own(acceleration(1, 9))
+    store.add_heard(acceleration(3, 9), 10)
+    rows, inputs = store.take(10, (1,), (1,))
+    assert (len(rows), inputs["agent"].tolist()) == (0, [0])
+    # THEN what names 3 comes once it is, with its slot, and what names 2 stays
+    rows, inputs = store.take(11, (1, 3), (1, 3))
+    assert sorted(zip(rows["agent"].tolist(), rows["other"].tolist(), strict=True)) == [(0, 1), *[(1, -1)] * 3]
+    assert inputs["agent"].tolist() == [1]
+    assert store.take(14, IDS, (1, 3))[0].size == 0
+    # AND after a window's length it is let go and counted
+    assert store.take(15, IDS, (1, 3))[0].size == 0
+    assert store.take(16, IDS, IDS)[0].size == 0
+    assert store.refused["not located"] == 1
+
+
+def test_without_edges_a_neighbour_is_who_was_heard_of_late(make_config: Callable[..., FleetConfig]) -> None:
+    hood = RecordStore(make_config(3, "transport.neighbour_timeout_s=2.0", "estimator.relay_hops=1"), 1).neighbourhood
+    assert [hood.hops(i) for i in IDS] == [0, 2, 2]
+    hood.hear(2, 100)
+    assert [hood.hops(i) for i in IDS] == [0, 1, 2]
+    assert hood.sends(position(2, 100))
+    assert not hood.sends(position(3, 100))
+    hood.hear(3, 121)
+    assert [hood.hops(i) for i in IDS] == [0, 2, 1]

@@ -15,7 +15,6 @@ from agent.clock import FleetClock
 from agent.config_tables import FleetConfig
 from agent.errors import RecordError
 from agent.health import Facts, Health, HealthMonitor, State, assess
-from agent.initial import Initialiser
 from agent.outputs import EstimateReady, estimate_message
 from agent.recording import (
     EstimateRecorder,
@@ -28,7 +27,6 @@ from agent.recording import (
 from agent.warmup import warm_up
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from transport.measurement_body import PositionRecord, RangeRecord, VelocityRecord
 
 MakeConfig = Callable[..., FleetConfig]
 
@@ -63,7 +61,7 @@ def test_a_step_of_utc_is_followed_at_once_and_said(size_s: float, forward: bool
 def facts(**changed: Any) -> Facts:
     good: dict[str, Any] = {
         "status": Status.OK, "own_sigma_m": 0.1, "gps_age_s": 0.2, "imu_coverage": 1.0,
-        "silent_neighbours": (), "autopilot": "connected",
+        "silent_neighbours": (), "autopilot": "connected", "located_neighbours": 4, "directions": 3,
     }  # fmt: skip
     return Facts(**{**good, **changed})
 
@@ -84,6 +82,23 @@ def facts(**changed: Any) -> Facts:
         ({"autopilot": "lost"}, State.OK, Health(State.DEGRADED, ("autopilot lost",))),
         ({"status": Status.FELL_BACK}, State.OK, Health(State.DEGRADED, ("estimate fell back",))),
         ({"status": Status.NOT_CONVERGED}, State.OK, Health(State.OK, ())),
+        ({"directions": 2, "located_neighbours": 0}, State.OK, Health(State.OK, ())),  # it has GPS
+        (
+            {"gps_age_s": 2.0, "located_neighbours": 2},
+            State.OK,
+            Health(State.DEGRADED, ("not observable: ranges to 2 of 3 located neighbours", "no GPS"), alarm=True),
+        ),
+        (
+            {"gps_age_s": 2.0, "directions": 2},
+            State.OK,
+            Health(State.DEGRADED, ("not observable: all located neighbours in one plane", "no GPS"), alarm=True),
+        ),
+        (
+            {"gps_age_s": None, "status": Status.NOT_OBSERVABLE, "ambiguous": True, "own_sigma_m": 90.0},
+            State.INIT,
+            Health(State.ALIGNING, ("not observable: the ranges leave more than one place", "no GPS"), alarm=True),
+        ),
+        ({"status": Status.NOT_OBSERVABLE}, State.OK, Health(State.DEGRADED, ("not observable",), alarm=True)),
     ],
 )
 def test_the_state_and_its_reasons_follow_from_the_facts(
@@ -103,6 +118,20 @@ def test_a_flapping_state_is_reported_once_a_second_and_the_last_word_comes_thro
     assert 2 <= len(reported) <= 6
     assert monitor.changes > 300
     assert reported[-1].state is monitor.health.state is State.OK
+
+
+def test_the_alarm_is_raised_and_cleared_as_changes_of_health() -> None:
+    monitor = HealthMonitor()
+    reported = []
+    for step in range(60):
+        blind = 20 <= step < 40
+        changed = facts(gps_age_s=9.0 if blind else 0.1, located_neighbours=2 if blind else 4)
+        health = monitor.update(changed, 100.0 + 0.1 * step)
+        if health is not None:
+            reported.append(health)
+    assert [health.alarm for health in reported] == [False, True, False]
+    assert str(reported[1]).startswith("ALARM, degraded: not observable: ranges to 2")
+    assert str(reported[2]) == "ok"
 
 
 # --- record ------------------------------------------------------------------------------------------------
@@ -181,66 +210,7 @@ def test_an_estimate_travels_with_its_senders_own_block() -> None:
     assert (message.tick, message.status, message.age_ticks) == (5, 0, (0, 3))
 
 
-# --- start -------------------------------------------------------------------------------------------------
-
-
-def position(observer: int, tick: int, north_m: float) -> PositionRecord:
-    return PositionRecord(observer, tick, (north_m, 1.0, -5.0), (0.1, 0.1, 0.1))
-
-
-def test_the_start_waits_for_own_fixes_and_a_while_for_those_of_others(make_config: MakeConfig) -> None:
-    start = Initialiser(make_config(2), 1)
-    assert not start.ready(100, 10.0)
-    for tick in range(98, 103):
-        start.note(position(1, tick, 3.0))
-    assert not start.ready(102, 10.3)
-    assert start.ready(102, 12.1)
-    start.note(position(2, 102, 9.0))
-    assert start.ready(102, 10.4)
-    mean, covariance = start.prior(102)
-    assert mean[[0, 6]].tolist() == [3.0, 9.0]
-    assert covariance.diagonal()[[0, 3]].tolist() == [2500.0, 9.0]
-
-
-def test_without_own_fixes_the_start_is_amid_the_neighbours(make_config: MakeConfig) -> None:
-    start = Initialiser(make_config(3), 3)
-    start.ready(0, 0.0)
-    start.note(position(1, 100, 2.0))
-    start.note(position(2, 100, 6.0))
-    start.note(VelocityRecord(2, 100, (1.0, 2.0, 0.0), (0.1, 0.1, 1e6)))
-    assert not start.ready(100, 9.9)
-    assert start.ready(100, 10.0)
-    mean, covariance = start.prior(100)
-    assert mean[[0, 6, 12]].tolist() == [2.0, 6.0, 4.0]
-    assert mean[9:12].tolist() == [1.0, 2.0, 0.0]
-    assert covariance[12, 12] == 4 * covariance[0, 0]
-
-
-def test_a_moving_drone_starts_at_the_velocity_of_its_fixes(make_config: MakeConfig) -> None:
-    start = Initialiser(make_config(2), 1)
-    for k in (3, 0, 4, 1, 2):
-        fix = PositionRecord(1, 100 + k, (0.6 * k + 0.06, 1.0, -0.3 * k), (0.1,) * 3, offset_s=0.01)
-        start.note(fix)
-        start.note(position(2, 100 + k % 2, 9.0))
-    mean, _ = start.prior(104)
-    assert mean[3:6] == pytest.approx([6.0, 0.0, -3.0])
-    assert mean[9:12].tolist() == [0.0, 0.0, 0.0]  # two instants show no velocity
-
-
-def test_old_fixes_start_nothing(make_config: MakeConfig) -> None:
-    start = Initialiser(make_config(2), 1)
-    for tick in range(5):
-        start.note(position(1, tick, 3.0))
-    assert not start.ready(50, 5.0)
-
-
-def test_an_unknown_drone_is_put_at_its_measured_distance(make_config: MakeConfig) -> None:
-    start = Initialiser(make_config(2), 1)
-    for tick in range(3):
-        start.note(position(1, tick, 3.0))
-    start.note(RangeRecord(1, 2, 2, 7.0, 0.01))
-    mean, _ = start.prior(2)
-    assert np.linalg.norm(mean[6:9] - mean[0:3]) == pytest.approx(7.0)
+# --- warm-up -----------------------------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf"])

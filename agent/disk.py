@@ -1,0 +1,36 @@
+"""How much a record may take of the disk."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+
+def free_bytes(directory: Path) -> int:
+    """What the disk of a folder has left for us; raises `OSError`."""
+    return shutil.disk_usage(directory).free
+
+
+class DiskLimit:
+    """Says when a record has to end: it is as large as it may be, or the disk is nearly full.
+
+    A disk that other programs fill up ends the record too: what is left belongs to those that need it more.
+    """
+
+    def __init__(
+        self, directory: Path, max_bytes: int, min_free_bytes: int, free: Callable[[Path], int] = free_bytes
+    ) -> None:
+        self._directory = directory
+        self._max_bytes = max_bytes
+        self._min_free_bytes = min_free_bytes
+        self._free = free
+
+    def reached(self, size_bytes: int) -> str:
+        """Why a record of this size may not grow, empty if it may; raises `OSError`."""
+        if size_bytes >= self._max_bytes:
+            return f"it has the {self._max_bytes / 1e6:g} MB of record.flight_max_mb"
+        free = self._free(self._directory)
+        if free < self._min_free_bytes:
+            return f"the disk has {free / 1e6:.0f} MB left, record.min_free_mb is {self._min_free_bytes / 1e6:g}"
+        return ""

@@ -14,6 +14,7 @@ from sim_bridge.navigation import Navigation
 from sim_bridge.quaternions import Array
 from sim_bridge.sensors import AttitudeSample, ImuSample
 from sim_bridge.streams import StreamTable
+from sim_bridge.truth_messages import TrueState
 
 
 class Vehicle(Protocol):
@@ -30,6 +31,10 @@ class Vehicle(Protocol):
 
     def attitude(self) -> AttitudeSample:
         """The present attitude."""
+        ...
+
+    def true_state(self) -> TrueState:
+        """What the simulator behind the autopilot knows."""
         ...
 
     def follow_path(self) -> None:

@@ -15,6 +15,7 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from agent.frames import FleetFrame, rotated
 from agent.mavlink_codec import Decoder, Encoder
+from agent.mavlink_signing import LinkSigning
 from sim_bridge import mavlink_wire as wire
 from sim_bridge.autopilot_commands import Command, CommandHandler
 from sim_bridge.autopilot_state import AutopilotState, BootClock, ParameterTable, Vehicle
@@ -39,7 +40,7 @@ class AutopilotSetup:
 
     ``sensor_rates_hz`` by message id bounds the streams; ``gravity_mps2`` is what the autopilot takes from
     its accelerometers; ``unix_offset_s`` is Unix time minus the clock of ``now``; ``gps_time_unknown`` sends
-    GPS stamps of zero, as PX4 does when it has no UTC.
+    GPS stamps of zero, as PX4 does when it has no UTC. With a ``signing_key`` it signs, and takes signed frames only.
     """
 
     flavour: FlavourName
@@ -50,6 +51,7 @@ class AutopilotSetup:
     clock_skew_ppm: float = 0.0
     stamp_quantum_us: int = 1
     gps_time_unknown: bool = False
+    signing_key: bytes | None = None
     sensor_rates_hz: dict[int, float] = field(default_factory=dict)
 
 
@@ -74,7 +76,10 @@ class FakeAutopilot:
         self.counters = AutopilotCounters()
         self._vehicle = vehicle
         self._parameters = ParameterTable(FLAVOURS[setup.flavour], setup.system_id)
-        self._decoder = Decoder(datagrams=True)
+        self._signing: LinkSigning | None = None
+        if setup.signing_key is not None:
+            self._signing = LinkSigning(setup.signing_key, unix_s=now + setup.unix_offset_s)
+        self._decoder = Decoder(datagrams=True, signing=self._signing)
         self._out: list[bytes] = []
         self._down_until_s: float | None = None
         self._handlers: dict[str, Callable[[Message, float], None]] = {
@@ -109,7 +114,7 @@ class FakeAutopilot:
             StreamTable(flavour, limits),
             airborne=not self._vehicle.landed,
         )
-        self._encoder = Encoder(setup.system_id, COMPONENT)
+        self._encoder = Encoder(setup.system_id, COMPONENT, self._signing)
         self._messages = StreamMessages(self.state, self._vehicle, setup.unix_offset_s, setup.system_id)
         self._commands = CommandHandler(self.state, self._vehicle, self._send_now, self._send)
         self._heartbeat_s = self._timesync_s = now
@@ -131,7 +136,7 @@ class FakeAutopilot:
         """Take one datagram; the frames sent in answer."""
         if self._is_down(now):
             return []
-        self._now = now
+        self._set_time(now)
         for message in self._decoder.feed(data):
             self._handle(message, now)
         frames = self._drain()
@@ -143,7 +148,7 @@ class FakeAutopilot:
         """The frames due by now: streams, heartbeat, own TIMESYNC requests."""
         if self._is_down(now):
             return []
-        self._now = now
+        self._set_time(now)
         self._navigate(now)
         if now >= self._heartbeat_s:
             self._send(self._messages.heartbeat())
@@ -175,6 +180,11 @@ class FakeAutopilot:
             return  # it waits for the receiver's silence to be long enough
         if state.streams.take(mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, now):
             self._send(self._gps_message(fix, taken_s))
+
+    def _set_time(self, now: float) -> None:
+        self._now = now
+        if self._signing is not None:
+            self._signing.unix_s = now + self.setup.unix_offset_s
 
     def _gps_message(self, fix: GpsFix, taken_s: float) -> Message:
         stamp_us = 0 if self.setup.gps_time_unknown else self.state.clock.us(taken_s)

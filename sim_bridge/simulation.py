@@ -8,11 +8,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from sim_bridge import quaternions
 from sim_bridge.fake_autopilot import AutopilotSetup, FakeAutopilot
 from sim_bridge.guidance import Waypoints, default_path
 from sim_bridge.link_faults import FaultyLink
@@ -20,6 +22,7 @@ from sim_bridge.quaternions import Array
 from sim_bridge.scenario import Reboot, Scenario
 from sim_bridge.sensors import AttitudeSample, FleetSensors, ImuSample, RangeSet
 from sim_bridge.truth import Truth, TruthRecorder
+from sim_bridge.truth_messages import TrueState
 from sim_bridge.world import Dynamics, FleetWorld
 
 STEP_TOLERANCE_S = 1e-9
@@ -66,6 +69,19 @@ class SimulatedVehicle:
             self._attitude = self._sensors.attitude(self._slot)
         return self._attitude
 
+    def true_state(self) -> TrueState:
+        """The truth of this step."""
+        world, slot = self._world, self._slot
+        quaternion = world.attitude()[slot]
+        force_ned = world.specific_force_ned()[slot]
+        return TrueState(
+            world.position_m[slot].copy(),
+            world.velocity_mps[slot].copy(),
+            quaternion,
+            quaternions.rotate(quaternions.conjugate(quaternion[None]), force_ned[None])[0],
+            world.body_rates()[slot],
+        )
+
     def _position(self) -> tuple[float, float, float]:
         north, east, down = (float(axis) for axis in self._world.position_m[self._slot])
         return north, east, down
@@ -99,7 +115,15 @@ class Simulation:
     happens; see `aligned_start` for a start on a tick.
     """
 
-    def __init__(self, scenario: Scenario, start_s: float = 0.0, unix_offset_s: float = 0.0) -> None:
+    def __init__(
+        self,
+        scenario: Scenario,
+        start_s: float = 0.0,
+        unix_offset_s: float = 0.0,
+        signing_keys: Mapping[int, bytes] | None = None,
+    ) -> None:
+        """``signing_keys`` by agent are those of autopilots that sign."""
+        self._signing_keys = signing_keys or {}
         self.scenario, self.start_s, self.unix_offset_s = scenario, start_s, unix_offset_s
         self.world = _world(scenario)
         self.sensors = FleetSensors(scenario, self.world, start_s + unix_offset_s - scenario.epoch_unix_s)
@@ -131,6 +155,7 @@ class Simulation:
             clock_skew_ppm=vehicle.clock_skew_ppm,
             stamp_quantum_us=vehicle.stamp_quantum_us,
             gps_time_unknown=vehicle.gps_time_unknown,
+            signing_key=self._signing_keys.get(vehicle.agent),
             sensor_rates_hz=rates,
         )
 

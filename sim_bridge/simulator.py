@@ -6,19 +6,21 @@ import asyncio
 import logging
 import signal
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator, Mapping
 from contextlib import asynccontextmanager, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config_tables import FleetConfig
 from agent.endpoints import Endpoint, parse_endpoint
+from agent.security import driver_session, simulated_mavlink_keys
 from sim_bridge.scenario import Scenario
 from sim_bridge.scenario_config import scenario_from_config
 from sim_bridge.simulation import Outputs, Simulation, aligned_start
 from sim_bridge.udp_autopilot import AutopilotPort, open_port
 from sim_bridge.uwb_frames import UwbDrivers
-from transport.session import Handlers, open_session
+from transport.errors import TransportError
+from transport.session import Handlers, Session, open_session
 from transport.session_settings import SessionSettings
 from transport.streams import Stream
 
@@ -160,9 +162,48 @@ def stop_signals(stop: asyncio.Event) -> Iterator[None]:
 
 
 def range_session_settings(config: FleetConfig) -> SessionSettings:
-    """Zenoh settings of the UWB drivers' session: dials every agent, listens nowhere."""
-    endpoints = (endpoint for agent in config.ids for endpoint in config.listen(agent))
+    """Zenoh settings of the UWB drivers' session on plain links: dials every agent, listens nowhere."""
+    endpoints = (endpoint for agent in config.ids for endpoint in config.device_endpoints(agent))
     return SessionSettings(connect=tuple(dict.fromkeys(endpoints)))
+
+
+class RangeSessions:
+    """The UWB drivers' sessions with their agents, which they dial.
+
+    One session for all, as long as nobody asks who it is; with certificates one for each agent, under its own.
+    """
+
+    def __init__(self, sessions: dict[int, Session]) -> None:
+        self._sessions = sessions
+
+    def publish(self, observer: int, payload: bytes) -> bool:
+        """Put ranges that an agent measured on its key; whether they were taken."""
+        return self._sessions[observer].publish(Stream.UWB, payload, agent_id=observer)
+
+    async def close(self) -> None:
+        """Leave."""
+        for session in dict.fromkeys(self._sessions.values()):
+            await session.close()
+
+
+async def open_range_sessions(
+    config: FleetConfig, base: Path, settings: SessionSettings | None = None
+) -> RangeSessions:
+    """The sessions of all UWB drivers, or with ``settings`` one of these; raises `SessionError`."""
+    fleet, handlers = config.fleet.name, Handlers(lambda _key, _payload, _arrived_s: None)
+    if settings is not None or config.security.profile != "field":
+        settings = settings or range_session_settings(config)
+        session = await open_session(settings, fleet, None, config.ids, handlers)
+        return RangeSessions(dict.fromkeys(config.ids, session))
+    sessions: dict[int, Session] = {}
+    try:
+        for agent_id in config.ids:
+            own = driver_session(config, agent_id, base)
+            sessions[agent_id] = await open_session(own, fleet, agent_id, config.ids, handlers)
+    except TransportError:
+        await RangeSessions(sessions).close()
+        raise
+    return RangeSessions(sessions)
 
 
 async def simulate(
@@ -174,40 +215,37 @@ async def simulate(
     session_settings: SessionSettings | None = None,
     stop: asyncio.Event | None = None,
     on_advance: OnAdvance | None = None,
+    base: Path = Path(),
 ) -> SimulatorReport:
-    """Run the whole simulator of a fleet.
+    """Run the whole simulator of a fleet; ``base`` is the folder that the key folder is relative to.
 
     Starts on the first tick at or after ``start_unix_s`` (absent: now), lasts ``duration_s`` (absent: that of
     ``[sim]``) or until ``stop``, SIGTERM or SIGINT, and then writes the truth. Raises `ScenarioError`,
-    `PortError`, `EndpointError` or `transport.errors.SessionError` before anything moves.
+    `PortError`, `EndpointError`, `KeyFileError` or `SessionError` of `transport.errors` before anything moves.
     """
     scenario = scenario_from_config(config)
     links = {agent.id: parse_endpoint(agent.mavlink) for agent in config.agents}
-    simulation = _simulation_now(scenario, start_unix_s)
+    simulation = _simulation_now(scenario, start_unix_s, simulated_mavlink_keys(config, base))
     stop = stop or asyncio.Event()
-    settings = session_settings or range_session_settings(config)
-    session = await open_session(
-        settings, config.fleet.name, None, config.ids, Handlers(lambda _key, _payload, _arrived_s: None)
-    )
-    simulator = Simulator(
-        simulation,
-        lambda observer, payload: session.publish(Stream.UWB, payload, agent_id=observer),
-        on_advance,
-    )
+    sessions = await open_range_sessions(config, base, session_settings)
+    simulator = Simulator(simulation, sessions.publish, on_advance)
     try:
         async with simulator.serve(links):
             with stop_signals(stop):
                 return await simulator.run(config.sim.duration_s if duration_s is None else duration_s, stop)
     finally:
-        await session.close()
+        await sessions.close()
         if truth_file is not None and simulation.world.time_s > 0.0:
             simulation.truth().save(truth_file)
 
 
-def _simulation_now(scenario: Scenario, start_unix_s: float | None) -> Simulation:
+def _simulation_now(
+    scenario: Scenario, start_unix_s: float | None, signing_keys: Mapping[int, bytes]
+) -> Simulation:
     """A simulation on the monotonic clock of this host."""
     unix_offset_s = time.time() - time.monotonic()
     earliest_s = time.monotonic()
     if start_unix_s is not None:
         earliest_s = max(earliest_s, start_unix_s - unix_offset_s)
-    return Simulation(scenario, aligned_start(earliest_s, unix_offset_s, scenario), unix_offset_s)
+    start_s = aligned_start(earliest_s, unix_offset_s, scenario)
+    return Simulation(scenario, start_s, unix_offset_s, signing_keys)

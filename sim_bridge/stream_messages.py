@@ -11,6 +11,7 @@ from sim_bridge import mavlink_wire as wire
 from sim_bridge import quaternions
 from sim_bridge.autopilot_state import AutopilotState, Vehicle
 from sim_bridge.mavlink_wire import Message
+from sim_bridge.truth_messages import Geodetic, TrueState, hil_state_quaternion, sim_state, simstate
 
 SENSORS_PRESENT = (
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -50,6 +51,9 @@ class StreamMessages:
             mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: self._ekf_status,
             mavlink.MAVLINK_MSG_ID_EXTENDED_SYS_STATE: self._extended_state,
             mavlink.MAVLINK_MSG_ID_AUTOPILOT_VERSION: self._version,
+            mavlink.MAVLINK_MSG_ID_SIM_STATE: lambda _now: self._truth(sim_state),
+            mavlink.MAVLINK_MSG_ID_SIMSTATE: lambda _now: self._truth(simstate),
+            mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION: lambda _now: self._truth(hil_state_quaternion),
         }
 
     def build(self, message_id: int, now: float) -> Message | None:
@@ -174,6 +178,10 @@ class StreamMessages:
         return mavlink.MAVLink_extended_sys_state_message(
             mavlink.MAV_VTOL_STATE_UNDEFINED, states[self._vehicle.landed]
         )
+
+    def _truth(self, message: Callable[[TrueState, Geodetic], Message]) -> Message:
+        state = self._vehicle.true_state()
+        return message(state, self._state.geodetic(state.position_m))
 
     def _version(self, _now: float) -> Message:
         flavour = self._state.flavour

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import socket
 from collections.abc import Callable
 from typing import Any, cast
 
@@ -93,10 +94,13 @@ async def open_port(daemon: Endpoint, accept: Accept) -> AutopilotPort:
         )
     loop = asyncio.get_running_loop()
     try:
+        if remote is not None:  # a name is looked up once, not for every datagram
+            found = await loop.getaddrinfo(*remote, family=socket.AF_INET, type=socket.SOCK_DGRAM)
+            remote = (str(found[0][4][0]), remote[1])
         _, port = await loop.create_datagram_endpoint(lambda: AutopilotPort(remote, accept), local_addr=local)
     except OSError as error:
         raise PortError(
-            f"simulated autopilot: cannot open UDP {local[0]}:{local[1]}: {error.strerror or error}; "
-            "is another simulator or autopilot running there?"
+            f"simulated autopilot of {daemon}: cannot open UDP {local[0]}:{local[1]}: {error.strerror or error}; "
+            "is another simulator or autopilot running there, or the name unknown?"
         ) from error
     return port

@@ -19,7 +19,8 @@ from sim_bridge.uwb_frames import UwbDrivers
 from transport.uwb_body import UwbIntake
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-FLEETS = [file for file in sorted(CONFIGS.glob("*.toml")) if "agents" in tomllib.loads(file.read_text())]
+TABLES = {file: tomllib.loads(file.read_text()) for file in sorted(CONFIGS.glob("*.toml"))}
+FLEETS = [file for file, tables in TABLES.items() if "paths" in tables.get("sim", {})]
 FLEET = (Vehicle(1, "px4", 1), Vehicle(2, "ardupilot", 2), Vehicle(3, "px4", 3))
 
 

@@ -1,4 +1,4 @@
-"""``fleetloc keys``: the signing keys of a fleet."""
+"""``fleetloc keys``: signing keys, certificates, group key and MAVLink keys of a fleet."""
 
 from __future__ import annotations
 
@@ -8,72 +8,132 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:
-    from transport.keys import KeyInfo
+    from fleetloc.fleet_keys import FleetKeys
 
 Config = Annotated[Path, typer.Argument(help="Configuration of the fleet; its security.keys names the folder.")]
 AgentId = Annotated[int, typer.Option("--id", help="Agent.")]
+OptionalId = Annotated[int | None, typer.Option("--id", help="Agent.")]
+Days = Annotated[float, typer.Option("--days", min=1, max=3650, help="How long certificates are valid.")]
+Group = Annotated[bool, typer.Option("--group", help="The key that encrypts payloads.")]
 
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
-    keys = typer.Typer(help="Make, list and replace the signing keys of a fleet.", no_args_is_help=True)
+    keys = typer.Typer(help="Make, list, replace and hand out the keys of a fleet.", no_args_is_help=True)
     keys.command("init")(init)
     keys.command("add")(add)
     keys.command("list")(list_all)
     keys.command("rotate")(rotate)
     keys.command("retire")(retire)
+    keys.command("export")(export)
+    keys.command("passphrase")(passphrase)
     app.add_typer(keys, name="keys")
 
 
-def init(config: Config) -> None:
-    """Make the folder and a key pair for every agent; no key that exists is overwritten."""
-    from transport.keys import init_keys
+def init(
+    config: Config,
+    days: Days = 90,
+    missing: Annotated[
+        bool, typer.Option("--missing", help="Make only what is not there, e.g. certificates beside older keys.")
+    ] = False,
+) -> None:
+    """Make the folder with everything for every agent; nothing that exists is overwritten."""
+    keys = _keys(config, days=days)
+    keys.init(missing_only=missing)
+    _print(keys)
+    typer.echo(f"keys in {keys.folder}: `fleetloc keys export` makes a drone's folder; ca.key stays here", err=True)
 
-    folder, ids = _folder_and_ids(config)
-    _print(init_keys(folder, ids))
-    typer.echo(f"keys in {folder}: give each drone its own .key and everybody's .pub", err=True)
 
-
-def add(config: Config, agent_id: AgentId) -> None:
-    """Make a key pair for one more agent."""
-    from transport.keys import add_key
-
-    _print([add_key(_folder_and_ids(config, agent_id)[0], agent_id)])
+def add(config: Config, agent_id: AgentId, days: Days = 90) -> None:
+    """Make everything for one more agent."""
+    keys = _keys(config, agent_id, days=days)
+    keys.add(agent_id)
+    _print(keys)
 
 
 def list_all(config: Config) -> None:
-    """Show whose keys are there, by fingerprint."""
-    from transport.keys import list_keys
-
-    _print(list_keys(_folder_and_ids(config)[0]))
+    """Show what is there, by fingerprint, and when certificates expire."""
+    _print(_keys(config))
 
 
-def rotate(config: Config, agent_id: AgentId) -> None:
-    """Give an agent a new key pair; its present public key is still accepted until `retire`."""
-    from transport.keys import rotate_key
+def rotate(
+    config: Config,
+    agent_id: OptionalId = None,
+    group: Group = False,
+    observer: Annotated[bool, typer.Option("--observer", help="The certificate of those who only listen.")] = False,
+    mavlink: Annotated[bool, typer.Option("--mavlink", help="With --id: the key of its MAVLink link.")] = False,
+    days: Days = 90,
+) -> None:
+    """Give an agent a new signing key and certificate, or replace what is named.
 
-    _print([rotate_key(_folder_and_ids(config, agent_id)[0], agent_id)])
+    The signing key and group key from before are accepted until `retire`, a certificate until it expires.
+    """
+    keys = _keys(config, agent_id, days=days)
+    _one_of(agent_id is not None, group, observer)
+    if group:
+        keys.rotate_group()
+    elif observer:
+        keys.certify(None)
+    elif agent_id is not None and mavlink:
+        keys.rotate_mavlink(agent_id)
+    elif agent_id is not None:
+        keys.rotate(agent_id)
+    _print(keys)
 
 
-def retire(config: Config, agent_id: AgentId) -> None:
-    """Stop accepting the key from before an agent's last rotation."""
-    from transport.keys import retire_key
+def retire(config: Config, agent_id: OptionalId = None, group: Group = False) -> None:
+    """Stop accepting the key from before the last rotation."""
+    keys = _keys(config, agent_id)
+    _one_of(agent_id is not None, group)
+    if agent_id is not None:
+        keys.retire(agent_id)
+    else:
+        keys.retire_group()
+    _print(keys)
 
-    _print([retire_key(_folder_and_ids(config, agent_id)[0], agent_id)])
+
+def export(
+    config: Config,
+    out: Annotated[Path, typer.Option("--out", help="New folder; it becomes security.keys there.")],
+    agent_id: OptionalId = None,
+    observer: Annotated[bool, typer.Option("--observer", help="For someone who only listens.")] = False,
+) -> None:
+    """Copy what one drone needs, and nothing else, into a new folder: no other drone's secret, no authority's key."""
+    keys = _keys(config, agent_id)
+    _one_of(agent_id is not None, observer)
+    files = keys.export(agent_id, out)
+    typer.echo(f"{out}: {', '.join(path.name for path in files)}")
 
 
-def _folder_and_ids(config: Path, agent_id: int | None = None) -> tuple[Path, tuple[int, ...]]:
-    """The key folder of a configuration and the ids of its fleet, ``agent_id`` checked against them."""
+def passphrase(config: Config, agent_id: AgentId) -> None:
+    """Print the passphrase to type into a ground station that sets MAVLink signing up on an agent's autopilot."""
+    from transport.shared_keys import load_mavlink_passphrase
+
+    typer.echo(load_mavlink_passphrase(_keys(config, agent_id).folder, agent_id))
+
+
+def _keys(config: Path, agent_id: int | None = None, *, days: float = 90) -> FleetKeys:
+    """The keys of a configuration's fleet, ``agent_id`` checked against it."""
+    import time
+
     from agent.config import load_config
     from fleetloc.errors import InputError
+    from fleetloc.fleet_keys import FleetKeys
 
     fleet = load_config(config)
     if agent_id is not None and agent_id not in fleet.ids:
         raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
-    return config.parent / fleet.security.keys, fleet.ids
+    return FleetKeys(fleet, config.parent, time.time(), days)
 
 
-def _print(infos: list[KeyInfo]) -> None:
-    for info in infos:
-        secret = "secret here" if info.has_secret else "public only"
-        typer.echo(f"agent {info.agent_id:3d}  {secret}  {'  '.join(info.fingerprints)}")
+def _one_of(*chosen: bool) -> None:
+    from fleetloc.errors import InputError
+
+    if sum(chosen) != 1:
+        expected = "one of --id, --group, --observer (those that the command has)"
+        raise InputError("options", "", expected, f"{sum(chosen)} of them")
+
+
+def _print(keys: FleetKeys) -> None:
+    for line in keys.lines():
+        typer.echo(line)

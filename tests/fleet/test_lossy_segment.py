@@ -1,0 +1,87 @@
+"""Daemons on a segment that really loses and delays frames: warm, and cold, when the first handshakes are lost too.
+
+The long runs, link by link, are `tests.fleet.measure_links`; docs/links.md has their figures.
+"""
+
+from __future__ import annotations
+
+import time
+from itertools import permutations
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from agent.config import load_config
+from fleetloc.fleet_report import report_figures
+from fleetloc.fleet_results import load_results
+from fleetloc.lockstep_run import fly_in_lockstep
+from tests.support.lossnet.delivery import Delivery, delivery
+from tests.support.lossnet.flight import LossyFlight, why_not
+
+ROOT = Path(__file__).parents[2]
+LINE3 = ROOT / "configs" / "line3.toml"
+LOSSY_RADIO = ROOT / "configs" / "links" / "lossy_radio.toml"
+ALL_PAIRS = "fleet.edges=[[1,2],[1,3],[2,3]]"
+LOSS, DELAY_S, LEAST_ON_TIME = 0.3, 0.05, 0.95
+WARM_S, COLD_S = 8.0, 15.0
+"""A cold link comes up when all four datagrams of a handshake get through: every fourth try, two tries in 3 s."""
+MEETING_S = 2.0
+
+pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() is not None, reason=str(why_not()))]
+
+
+def fly(out: Path, *, cold: bool, duration_s: float) -> tuple[dict[str, Any], Delivery, int]:
+    """Fly line3, everybody a neighbour of everybody; figures of the fleet, delivery, subscriptions repeated."""
+    with LossyFlight(LINE3, out, [ALL_PAIRS], [LOSSY_RADIO]) as flight:
+        if cold:
+            flight.set_faults(loss=LOSS, delay_s=DELAY_S)
+        flight.start_daemons()
+        if not cold:
+            time.sleep(MEETING_S)  # the daemons have nothing to say yet by which it could be seen that they met
+            flight.set_faults(loss=LOSS, delay_s=DELAY_S)
+        begin_s = time.time()
+        flight.fly(duration_s)
+        end_s = time.time()
+        report = flight.report()
+        repeated = sum(flight.counters(agent_id)["counters"]["subscriptions repeated"] for agent_id in flight.ids)
+        pairs = list(permutations(flight.ids, 2))
+    return report["fleet"], delivery(out, pairs, begin_s, end_s), repeated
+
+
+@pytest.fixture(scope="module")
+def lossless_rmse_m(tmp_path_factory: pytest.TempPathFactory) -> float:
+    """Of the same flight in virtual time without a loss."""
+    out = tmp_path_factory.mktemp("lossless")
+    config = load_config(LINE3, [ALL_PAIRS, f"sim.duration_s={WARM_S}"])
+    outcome = fly_in_lockstep(config, out)
+    rmse_m: float = report_figures(config, load_results(config, out), out, outcome, "lockstep")["fleet"][
+        "position_rmse_m"
+    ]
+    return rmse_m
+
+
+def test_a_fleet_that_met_before_flies_through_a_radio_that_loses_a_third(
+    tmp_path: Path, lossless_rmse_m: float
+) -> None:
+    # GIVEN links that are up WHEN 30 % of all frames are lost from then on and the rest is 50 ms late
+    fleet, found, _ = fly(tmp_path, cold=False, duration_s=WARM_S)
+    # THEN every pair hears what one frame's chance leaves, and nothing waits for what was lost
+    assert found.dead == 0
+    assert min(found.share.values()) > 0.5
+    assert found.mean == pytest.approx(1 - LOSS, abs=0.08)
+    assert found.age_s(10) >= DELAY_S - 0.001
+    assert found.age_s(90) < 4 * DELAY_S
+    # AND estimates are in time and as good as without a loss (on a machine that may be busy with other things)
+    assert fleet["ticks_on_time_fraction"] >= LEAST_ON_TIME
+    assert fleet["position_rmse_m"] <= 1.5 * lossless_rmse_m
+
+
+def test_a_fleet_that_starts_under_loss_meets_all_the_same(tmp_path: Path, lossless_rmse_m: float) -> None:
+    # GIVEN handshakes and declarations any of which may be lost
+    fleet, found, repeated = fly(tmp_path, cold=True, duration_s=COLD_S)
+    # THEN they were repeated until no pair was left that hears nothing
+    assert repeated > 0
+    assert found.dead == 0
+    assert fleet["ticks_on_time_fraction"] >= LEAST_ON_TIME
+    assert fleet["position_rmse_m"] <= 1.5 * lossless_rmse_m

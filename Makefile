@@ -1,5 +1,6 @@
 # make test   everything that must hold: lint, types, rooms, tests
 # make demo   a minute of a live fleet of three drones; says where its report is
+# make test-compose  build the images and fly the compose fleets (skipped without a container engine)
 # make lock   resolve the dependencies anew and write requirements.lock
 # make lowest run the tests with the lowest version of each dependency that pyproject.toml admits
 
@@ -12,7 +13,7 @@ IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "fleetloc n
 DEMO_FOLDER := out/demo
 DEMO_SECONDS := 60
 
-.PHONY: test demo lock lowest clean
+.PHONY: test demo test-compose lock lowest clean
 
 test: $(INSTALLED)
 	$(BIN)/ruff check
@@ -23,6 +24,10 @@ test: $(INSTALLED)
 demo: $(INSTALLED)
 	$(BIN)/fleetloc fleet configs/line3.toml --duration $(DEMO_SECONDS) --out $(DEMO_FOLDER)
 	@echo "open $(DEMO_FOLDER)/report.html in a browser; the figures are in $(DEMO_FOLDER)/report.json"
+
+test-compose:
+	$(PYTHON) tests/compose/run_compose.py
+	$(PYTHON) tests/compose/run_compose.py --lossy
 
 # The stamp is newer than the lock and the project file exactly when both are installed.
 $(INSTALLED): requirements.lock pyproject.toml

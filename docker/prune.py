@@ -1,0 +1,39 @@
+"""Take out of an environment what never runs in a fleet: the tests of libraries and unused MAVLink dialects.
+
+``python prune.py PREFIX``; says what it freed.
+"""
+
+import shutil
+import sys
+from pathlib import Path
+
+DIALECT = "ardupilotmega"
+"""The one dialect that is spoken (v2.0)."""
+TESTED = ("numba", "scipy", "matplotlib", "mpl_toolkits")
+"""Libraries whose folders named tests nothing imports."""
+
+
+def unneeded(packages: Path) -> list[Path]:
+    """Folders and files to remove, none inside another."""
+    found = [folder for name in TESTED for folder in (packages / name).rglob("tests") if folder.is_dir()]
+    dialects = packages / "pymavlink" / "dialects"
+    found += [folder for folder in dialects.iterdir() if folder.is_dir() and folder.name != "v20"]
+    found += [file for file in (dialects / "v20").iterdir() if file.stem not in (DIALECT, "__init__")]
+    return found
+
+
+def size_bytes(path: Path) -> int:
+    """Size of a file or of all files of a folder."""
+    files = path.rglob("*") if path.is_dir() else [path]
+    return sum(file.stat().st_size for file in files if file.is_file())
+
+
+(site,) = Path(sys.argv[1]).glob("lib/python*/site-packages")
+freed = 0
+for path in unneeded(site):
+    freed += size_bytes(path)
+    if path.is_dir():
+        shutil.rmtree(path)
+    else:
+        path.unlink()
+sys.stdout.write(f"pruned {freed / 1e6:.0f} MB\n")

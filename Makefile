@@ -1,6 +1,7 @@
 # make test   everything that must hold: lint, types, rooms, tests
 # make demo   a minute of a live fleet of three drones; says where its report is
 # make test-compose  build the images and fly the compose fleets (skipped without a container engine)
+# make docs   the configuration reference anew, and the documentation as a site in build/site
 # make lock   resolve the dependencies anew and write requirements.lock
 # make lowest run the tests with the lowest version of each dependency that pyproject.toml admits
 
@@ -13,7 +14,7 @@ IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "fleetloc n
 DEMO_FOLDER := out/demo
 DEMO_SECONDS := 60
 
-.PHONY: test demo test-compose lock lowest clean
+.PHONY: test demo test-compose docs lock lowest clean
 
 test: $(INSTALLED)
 	$(BIN)/ruff check
@@ -28,6 +29,13 @@ demo: $(INSTALLED)
 test-compose:
 	$(PYTHON) tests/compose/run_compose.py
 	$(PYTHON) tests/compose/run_compose.py --lossy
+
+docs: $(INSTALLED)
+	mkdir -p build
+	$(BIN)/python -m fleetloc.config_reference > build/configuration.md
+	mv build/configuration.md docs/configuration.md
+	$(BIN)/python -m pip install $(PIP_OPTIONS) 'mkdocs>=1.6'
+	$(BIN)/mkdocs build --strict
 
 # The stamp is newer than the lock and the project file exactly when both are installed.
 $(INSTALLED): requirements.lock pyproject.toml

@@ -1,0 +1,274 @@
+"""The documentation holds what it says: links, pictures, commands, options and configuration keys exist."""
+
+from __future__ import annotations
+
+import re
+import shlex
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import msgspec
+import pytest
+import typer
+import yaml
+
+from agent.config import FleetConfig, config_from, merged
+from agent.config_tables import SensorsTable
+from agent.exit_codes import ExitCode
+from agent.health import Facts, State, assess
+from agent.uwb import UwbAdapter
+from estimators.estimator import Status
+from fleetloc.cli import build_app
+from sim_bridge.sitl_mission import load_mission
+from transport.errors import Reason
+
+ROOT = Path(__file__).parents[1]
+DOCS = ROOT / "docs"
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+SITE = ROOT / "mkdocs.yml"
+FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<text>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL)
+INLINE = re.compile(r"`(fleetloc [^`\n]+)`")
+LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
+SHELL = ("sh", "bash", "console", "")
+ROOMS = "configs|tests|estimators|transport|agent|sim_bridge|fleetloc"
+OURS = re.compile(rf"(?<![\w/.])(?:{ROOMS})/(?:[\w-]+/)*[\w-]+\.(?:py|toml)\b")
+CONTROL = ("|", "&", "&&", "||", ";", ">", "<", "2>", "#", "\\")
+TABLES = {field.name for field in msgspec.structs.fields(FleetConfig)}
+
+
+class Block(NamedTuple):
+    """One fenced block of a page."""
+
+    page: str
+    language: str
+    text: str
+
+
+def blocks() -> list[Block]:
+    return [
+        Block(page.name, found["language"], re.sub(rf"^{found['indent']}", "", found["text"], flags=re.MULTILINE))
+        for page in PAGES
+        for found in FENCE.finditer(page.read_text(encoding="utf-8"))
+    ]
+
+
+def prose(page: Path) -> str:
+    """A page without its fenced blocks and inline code, where brackets mean other things."""
+    return re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text(encoding="utf-8")))
+
+
+# --- links ----------------------------------------------------------------------------------------------------
+
+
+def slugs(page: Path) -> set[str]:
+    """The anchors of a page's headings, as mkdocs and the usual forges make them."""
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#+ (.+)$", text, re.MULTILINE)
+    return {re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", heading.lower()).strip()) for heading in headings}
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_every_relative_link_and_picture_is_there(page: Path) -> None:
+    for target in LINK.findall(prose(page)):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        found = page if not name else (page.parent / name)
+        assert found.exists(), f"{page.name}: {target}: no such file"
+        assert page.parent != DOCS or found.resolve().is_relative_to(DOCS), f"{page.name}: {target}: not in the site"
+        if anchor:
+            assert anchor in slugs(found), f"{page.name}: {target}: no such heading; there are {sorted(slugs(found))}"
+
+
+def test_the_site_names_every_page_once_and_no_other() -> None:
+    site = yaml.safe_load(SITE.read_text(encoding="utf-8"))
+    named = [page for section in site["nav"] for entries in section.values() for e in entries for page in e.values()]
+    assert sorted(named) == sorted(page.name for page in DOCS.glob("*.md"))
+
+
+def test_pictures_are_small() -> None:
+    for picture in (DOCS / "images").iterdir():
+        assert picture.stat().st_size < 200_000, f"{picture.name}: expected less than 200 kB"
+
+
+# --- commands -------------------------------------------------------------------------------------------------
+
+
+def written_commands() -> Iterator[tuple[str, str]]:
+    """(page, what follows ``fleetloc``) of every command in a shell block or in the text."""
+    for block in blocks():
+        if block.language in SHELL:
+            joined = block.text.replace("\\\n", " ")
+            for line in joined.splitlines():
+                found = re.match(r"(?:\$ )?(?:\w+=\S+ )*(?:\S*/)?fleetloc (.+)", line.strip())
+                if found:
+                    yield block.page, found[1]
+    for page in PAGES:
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        for found in INLINE.finditer(text):
+            yield page.name, found[1].removeprefix("fleetloc ")
+
+
+def complaint(app: Any, text: str) -> str | None:
+    """What is wrong with the names of commands and options in a line; ``None`` if nothing is.
+
+    Only names are looked at, so that a synopsis (``fleetloc check CONFIG [--print]``) passes too.
+    """
+    command = app
+    try:
+        words = shlex.split(re.sub(r"[\[\]]", " ", text).replace("\\|", "|"), comments=True)
+    except ValueError as error:
+        return str(error)
+    for word in words:
+        if word in CONTROL:
+            break
+        subcommands: dict[str, Any] | None = getattr(command, "commands", None)
+        if re.match(r"--?[a-z]", word):
+            options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)} | {"--help"}
+            if word.partition("=")[0] not in options:
+                return f"{command.name} has no option {word}; it has {sorted(options)}"
+        elif subcommands is not None:
+            for name in re.split(r"[|,]", word.strip("{}")):
+                if re.fullmatch(r"[a-z]\w*", name) and name not in subcommands:
+                    return f"{command.name} has no command {name}; it has {sorted(subcommands)}"
+            command = subcommands.get(word, command)
+    return None
+
+
+def test_every_command_and_option_shown_exists() -> None:
+    app = typer.main.get_command(build_app())
+    shown = list(written_commands())
+    wrong = [f"{page}: fleetloc {text}: {found}" for page, text in shown if (found := complaint(app, text))]
+    assert not wrong, "\n".join(wrong)
+    assert len(shown) > 50
+
+
+def test_a_wrong_command_or_option_would_be_found() -> None:
+    app = typer.main.get_command(build_app())
+    assert complaint(app, "fly configs/line3.toml") is not None
+    assert complaint(app, "fleet configs/line3.toml --losss 0.1") is not None
+    assert complaint(app, "keys innit fleet.toml") is not None
+    assert complaint(app, "bench loss --runs 20 | head -n 3") is None
+
+
+def test_every_file_of_ours_that_is_named_exists() -> None:
+    for page in PAGES:
+        for name in OURS.findall(page.read_text(encoding="utf-8")):
+            assert (ROOT / name).exists(), f"{page.name}: {name}: no such file"
+
+
+# --- configuration --------------------------------------------------------------------------------------------
+
+
+def stub() -> dict[str, Any]:
+    """A fleet over which a fragment is laid."""
+    agents = [{"id": i, "mavlink": f"udpin:127.0.0.1:{14_550 + i}"} for i in range(1, 10)]
+    origin = {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 400.0}
+    return {"fleet": {"name": "shown", "origin": origin}, "agents": agents}
+
+
+def toml_blocks() -> list[Block]:
+    return [block for block in blocks() if block.language == "toml"]
+
+
+@pytest.mark.parametrize("block", toml_blocks(), ids=lambda block: block.page)
+def test_every_toml_block_is_accepted(block: Block, tmp_path: Path) -> None:
+    document = tomllib.loads(block.text)
+    if "takeoff_m" in document:
+        mission = tmp_path / "mission.toml"
+        mission.write_text(block.text, encoding="utf-8")
+        load_mission(mission, config_from(stub(), "stub"))
+        return
+    assert document.keys() <= TABLES, f"{block.page}: begin the block with the header of its table"
+    config_from(merged(stub(), document), block.page)
+
+
+def test_the_first_configuration_is_whole() -> None:
+    """GIVEN the first block of the newcomer's page WHEN it is read by itself THEN it is a configuration."""
+    first = next(block for block in toml_blocks() if block.page == "first-configuration.md")
+    config = config_from(tomllib.loads(first.text), first.page)
+    assert config.ids == (1, 2, 3)
+
+
+# --- the driver -----------------------------------------------------------------------------------------------
+
+
+def test_the_shown_uwb_driver_makes_frames_that_the_daemon_takes() -> None:
+    """GIVEN the script of docs/uwb.md WHEN it frames lines of a module THEN the daemon has their ranges."""
+    script = next(block.text for block in blocks() if block.page == "uwb.md" and block.language == "python")
+    names: dict[str, Any] = {"__name__": "uwb_publisher"}
+    exec(compile(script, "docs/uwb.md", "exec"), names)
+    daemon = UwbAdapter(1, (2, 3), SensorsTable())
+
+    def receive(frame: bytes) -> list[tuple[int, float, float]]:
+        samples = daemon.receive(frame, now_s=100.0, host_s=50.0, unix_s=1.8e9)
+        return [(sample.target, sample.range_m, sample.sigma_m) for sample in samples]
+
+    assert receive(names["frame_of"]("2 12.34 0.2", 1, 0, 49_990_000_000)) == [(2, 12.34, 0.2)]
+    assert receive(names["frame_of"]("3 5.5", 1, 1, 49_990_000_000)) == [(3, 5.5, SensorsTable().uwb_sigma_m)]
+    with pytest.raises(ValueError, match="could not convert"):
+        names["frame_of"]("2 far", 1, 2, 0)
+
+
+def test_the_shown_json_frame_is_one() -> None:
+    shown = next(block.text for block in blocks() if block.page == "uwb.md" and block.language == "json")
+    daemon = UwbAdapter(1, (2,), SensorsTable())
+    (sample,) = daemon.receive(shown.encode(), now_s=100.0, host_s=81.794643123, unix_s=1.8e9)
+    assert (sample.target, sample.range_m, sample.sigma_m) == (2, 12.345, 0.10)
+
+
+# --- troubleshooting ------------------------------------------------------------------------------------------
+
+
+def troubleshooting() -> str:
+    return (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+
+
+def facts(**changed: Any) -> Facts:
+    """Those of a drone that is well, but for what is changed."""
+    well: dict[str, Any] = {
+        "status": Status.OK, "own_sigma_m": 0.1, "gps_age_s": 0.1, "imu_coverage": 1.0, "silent_neighbours": (),
+        "autopilot": "connected", "located_neighbours": 3, "directions": 3,
+    }  # fmt: skip
+    return Facts(**(well | changed))
+
+
+@pytest.mark.parametrize(
+    "troubled",
+    [
+        facts(status=None, waiting_for="waiting for fixes"),
+        facts(autopilot="searching"),
+        facts(autopilot="lost"),
+        facts(imu_coverage=0.5),
+        facts(gps_age_s=None),
+        facts(silent_neighbours=(2, 3)),
+        facts(own_sigma_m=6.0),
+        facts(own_sigma_m=60.0),
+        facts(gps_age_s=None, located_neighbours=2),
+        facts(gps_age_s=None, directions=2),
+        facts(gps_age_s=None, ambiguous=True),
+        facts(status=Status.FELL_BACK),
+        facts(status=Status.NO_DATA),
+    ],
+    ids=lambda troubled: "",
+)
+def test_every_reason_of_health_is_explained(troubled: Facts) -> None:
+    health = assess(troubled, State.OK)
+    assert health.reasons
+    for reason in health.reasons:
+        assert f"| `{reason}` |" in troubleshooting()
+
+
+def test_the_reasons_of_refusal_that_are_explained_exist() -> None:
+    section = troubleshooting().partition("### Refused packets")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`.*?) \|", section, re.MULTILINE)
+    named = [name for row in rows for name in re.findall(r"`(\w+)`", row)]
+    assert len(named) > 10
+    assert set(named) <= {reason.value for reason in Reason}
+
+
+def test_the_daemons_own_exit_codes_are_the_ones_told() -> None:
+    told = {int(code) for code in re.findall(r"exit (\d)", troubleshooting())}
+    assert told <= {int(code) for code in ExitCode}

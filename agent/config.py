@@ -311,6 +311,7 @@ def _check_agents(config: FleetConfig, where: str) -> None:
         except EndpointError as error:
             raise ConfigError(where, key, SPELLINGS, str(error)) from error
         opened = f"{endpoint.host}:{endpoint.port}" if endpoint.kind is not LinkKind.SERIAL else endpoint.host
+        opened = f"{agent.radio or ''} {opened}"  # an address of its own on the radio is a computer of its own
         if opened in seen and not opened.endswith(":0"):
             raise ConfigError(where, key, f"another address than agent {seen[opened]}'s", repr(agent.mavlink))
         seen[opened] = agent.id

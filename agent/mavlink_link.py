@@ -9,6 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import os
+import socket
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from typing import Any
@@ -19,6 +20,8 @@ from agent.errors import LinkError
 REOPEN_S = 1.0
 READ_BYTES = 4096
 MAX_WRITE_BUFFER_BYTES = 64 * 1024
+RECEIVE_BUFFER_BYTES = 1 << 20
+"""Of a UDP socket: a moment without the processor must not lose samples (a small datagram takes almost 1 kB of it)."""
 
 OnData = Callable[[bytes], bool]
 """Takes received bytes, tells whether a frame of the autopilot was in them."""
@@ -94,6 +97,8 @@ class UdpLink(MavlinkLink, asyncio.DatagramProtocol):
                 self._transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=address)
         except OSError as error:
             raise _unusable(self.endpoint, error) from error
+        socket_of_link: socket.socket = self._transport.get_extra_info("socket")
+        socket_of_link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
         self.opened += 1
         if not listening:
             self.peer = f"{address[0]}:{address[1]}"

@@ -149,3 +149,14 @@ def test_a_kind_brings_its_own_defaults_and_what_is_written_beats_them() -> None
     assert (paper.window, paper.rounds, paper.share_inputs, paper.relay_hops) == (2, 1, "none", 0)
     longer = load_estimator_settings(None, ["estimator.window=9"])
     assert (longer.kind, longer.window, longer.share_inputs) == ("dmhe_relay", 9, "fleet")
+
+
+def test_drones_with_addresses_on_the_radio_may_have_the_same_device() -> None:
+    document = tomllib.loads(LINE3.read_text())
+    for agent in document["agents"]:
+        agent["mavlink"] = "serial:/dev/ttyAMA0:921600"
+    with pytest.raises(ConfigError, match=r"agents\[1\].mavlink: expected another address than agent 1's"):
+        config_from(document, "here")
+    for agent in document["agents"]:
+        agent["radio"] = f"192.168.7.{agent['id']}"
+    assert config_from(document, "here").agent(3).mavlink == "serial:/dev/ttyAMA0:921600"

@@ -44,6 +44,6 @@ ENV PATH=/opt/fleetloc/bin:$PATH \
 USER fleetloc
 WORKDIR /data
 VOLUME /data
-HEALTHCHECK --interval=3s --timeout=15s --start-period=60s --retries=5 CMD ["fleetloc", "health", "/tmp/fleetloc.sock"]
+HEALTHCHECK --interval=5s --timeout=15s --start-period=60s --retries=5 CMD ["fleetloc", "health", "/tmp/fleetloc.sock"]
 ENTRYPOINT ["fleetloc"]
 CMD ["--help"]

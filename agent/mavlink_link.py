@@ -21,7 +21,7 @@ REOPEN_S = 1.0
 READ_BYTES = 4096
 MAX_WRITE_BUFFER_BYTES = 64 * 1024
 RECEIVE_BUFFER_BYTES = 1 << 20
-"""Of a UDP socket: a moment without the processor must not lose samples (a small datagram takes almost 1 kB of it)."""
+"""Of a UDP socket: a moment without the processor must not lose samples (a small datagram takes almost 1 kB)."""
 
 OnData = Callable[[bytes], bool]
 """Takes received bytes, tells whether a frame of the autopilot was in them."""

@@ -14,10 +14,10 @@ from agent.records import input_of, rows_of
 from estimators.layout import Layout
 from estimators.measurements import INPUT, ROW, InputTable, RowTable
 from transport.errors import EncodeError
-from transport.measurement_body import AccelerationRecord, Measurements, Record, as_sent, identity
+from transport.measurement_body import AccelerationRecord, Measurements, RangeRecord, Record, as_sent, identity
 
-_Entry = tuple[int, RowTable]
-"""(tick, rows or input of one record)."""
+_Entry = tuple[int, int, int, RowTable]
+"""Tick, slot of the agent, slot of the range's other end or -1, and the rows or the input of one record."""
 
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
@@ -90,6 +90,8 @@ class RecordStore:
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
         self._seen: dict[int, set[object]] = {}
+        self._held: dict[int, dict[int, Record]] = {}
+        """The objects taken in, by tick and ``id``: where packets are handed over as objects, most come again."""
         self._to_send: dict[int, list[Record]] = {}
         self._rows: list[_Entry] = []
         self._inputs: list[_Entry] = []
@@ -126,15 +128,13 @@ class RecordStore:
         to be a member, as long as an estimator's window could still use them.
         """
         slots = np.full(self._layout.size + 1, -1, np.int32)  # the last stays for "no other end"
-        usable = np.zeros(self._layout.size + 1, np.bool_)
-        usable[-1] = True
+        usable = [False] * self._layout.size + [True]
         for slot, agent in enumerate(members):
             slots[self._layout.slot(agent)] = slot
             usable[self._layout.slot(agent)] = agent in located
-        rows, self._rows = _parted(
-            self._rows, lambda at, row: at <= tick and bool(usable[row["agent"]] and usable[row["other"]])
-        )
-        inputs, self._inputs = _parted(self._inputs, lambda at, row: at < tick and bool(slots[row["agent"]] >= 0))
+        known = (slots >= 0).tolist()
+        rows, self._rows = _parted(self._rows, lambda at, a, b: at <= tick and usable[a] and usable[b])
+        inputs, self._inputs = _parted(self._inputs, lambda at, a, _: at < tick and known[a])
         self.forget(tick)
         joined, pushes = _joined(rows, ROW), _joined(inputs, INPUT)
         for field in ("agent", "other", "observer"):
@@ -145,13 +145,14 @@ class RecordStore:
     def forget(self, tick: int) -> None:
         """Let go what no window that ends at a tick or later could use."""
         first = tick - self._hold_ticks
-        late = sum(at < first for at, _ in self._rows)
+        late = sum(entry[0] < first for entry in self._rows)
         if late:
             self.refused["not located"] += late
         self._rows = [entry for entry in self._rows if entry[0] >= first]
         self._inputs = [entry for entry in self._inputs if entry[0] >= first]
         for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
             del self._seen[old]
+            self._held.pop(old, None)
             self._to_send.pop(old, None)
 
     def packet(self, tick: int) -> Measurements:
@@ -163,30 +164,39 @@ class RecordStore:
         return Measurements(tick, tuple(records))
 
     def _add(self, record: Record) -> bool:
-        seen = self._seen.setdefault(record.tick, set())
-        name = identity(record)
+        held = self._held.get(record.tick)
+        if held is None:
+            held = self._held[record.tick] = {}
+            self._seen[record.tick] = set()
+        if id(record) in held:
+            return False
+        name, seen = identity(record), self._seen[record.tick]
         if name in seen:
             return False
         seen.add(name)
+        held[id(record)] = record
         if self.neighbourhood.sends(record):
             self._to_send.setdefault(record.tick, []).append(record)
+        slot = self._layout.slot(record.observer)
         if isinstance(record, AccelerationRecord):
-            self._inputs.append((record.tick, input_of(record, self._layout)))
+            self._inputs.append((record.tick, slot, -1, input_of(record, self._layout)))
         else:
             rows = rows_of(record, self._layout)
+            other = self._layout.slot(record.other) if isinstance(record, RangeRecord) else -1
             if len(rows):
-                self._rows.append((record.tick, rows))
+                self._rows.append((record.tick, slot, other, rows))
         return True
 
 
-def _parted(entries: list[_Entry], wanted: Callable[[int, np.void], bool]) -> tuple[list[RowTable], list[_Entry]]:
-    """The tables that are wanted by their tick and first row (all rows of a record name the same), and the rest."""
+def _parted(entries: list[_Entry], wanted: Callable[[int, int, int], bool]) -> tuple[list[RowTable], list[_Entry]]:
+    """The tables that are wanted by their tick and the agents that they name, and the rest."""
     taken, left = [], []
-    for at, table in entries:
-        if wanted(at, table[0]):
+    for entry in entries:
+        at, agent, other, table = entry
+        if wanted(at, agent, other):
             taken.append(table)
         else:
-            left.append((at, table))
+            left.append(entry)
     return taken, left
 
 

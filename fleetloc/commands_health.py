@@ -23,13 +23,12 @@ def health(
     timeout_s: Annotated[float, typer.Option("--timeout", help="Seconds to wait for the answer.")] = 3.0,
 ) -> None:
     """Ask a daemon how it is: exit code 0 if it runs and is not at fault, 1 if it is, 3 if nobody answers."""
-    from agent.health import State
-    from agent.health_socket import STALE_AFTER_S, ask
+    from agent.health_query import STALE_AFTER_S, ask
 
     answer = ask(socket, timeout_s)
     state, reasons = answer["state"], ", ".join(answer["reasons"])
     stale = answer["age_s"] > STALE_AFTER_S
     typer.echo(f"{state}{f': {reasons}' if reasons else ''}{', but does not get on' if stale else ''}")
-    wrong = state != State.OK if require_ok else state == State.FAULT
+    wrong = state != "ok" if require_ok else state == "fault"
     if stale or wrong:
         raise typer.Exit(FAILED)

@@ -9,7 +9,8 @@ import pytest
 
 from agent.errors import LinkError
 from agent.health import Health, State
-from agent.health_socket import HealthSocket, ask
+from agent.health_query import ask
+from agent.health_socket import HealthSocket
 from agent.observers import DaemonState
 
 

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.health_socket import STALE_AFTER_S
+from agent.health import State
+from agent.health_query import STALE_AFTER_S
 from fleetloc import cli
 
 
@@ -28,7 +29,7 @@ def test_the_command_turns_the_answer_into_an_exit_code(
     code: int,
     said: str,
 ) -> None:
-    monkeypatch.setattr("agent.health_socket.ask", lambda _path, _timeout_s: answer)
+    monkeypatch.setattr("agent.health_query.ask", lambda _path, _timeout_s: answer)
     assert cli.main(["health", "some.sock", *options]) == code
     assert capsys.readouterr().out == said
 
@@ -38,3 +39,7 @@ def test_nobody_there_is_refused_in_one_line(tmp_path: Path, capsys: pytest.Capt
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "no answer: No such file or directory" in error
+
+
+def test_the_states_have_the_names_that_the_command_looks_for() -> None:
+    assert {"ok", "fault"} <= {str(state) for state in State}

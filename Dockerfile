@@ -29,7 +29,7 @@ RUN fleetloc warmup && rm /opt/fleetloc/kernels/lock
 FROM ${BASE_IMAGE} AS lossy-radio
 RUN apt-get update && apt-get install --yes --no-install-recommends nftables && rm -rf /var/lib/apt/lists/*
 COPY docker/lossy_radio.sh /usr/local/bin/lossy_radio
-ENTRYPOINT ["lossy_radio"]
+ENTRYPOINT ["/bin/sh", "/usr/local/bin/lossy_radio"]
 
 FROM ${BASE_IMAGE} AS fleetloc
 COPY --from=build /opt/fleetloc /opt/fleetloc

@@ -26,6 +26,9 @@ def register(app: typer.Typer) -> None:
 def agent(
     config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
     agent_id: Annotated[int, typer.Option("--id", help="Which of its agents this is.")],
+    profiles: Annotated[
+        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
+    ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
     ] = None,
@@ -42,25 +45,35 @@ def agent(
     """
     from agent.config import load_config
     from agent.daemon import run
-    from agent.errors import ConfigError
+    from agent.errors import ConfigError, RecordError
     from agent.exit_codes import ExitCode
-    from agent.logs import configure_logging
+    from agent.logs import configure_logging, log_file
+    from agent.observer_list import observers_of
     from estimators.factory import make_estimator
     from fleetloc.run_files import keep_earlier_record
     from fleetloc.warmup import announce
+    from transport.errors import KeyFileError
 
     settings = list(overrides or ())
     if out is not None:
         settings.append(f"record.directory={out}")
     try:
-        fleet = load_config(config, settings)
+        fleet = load_config(config, settings, profiles or ())
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.CONFIG) from error
-    configure_logging(0 if quiet else 1 + verbose)
+    try:
+        configure_logging(0 if quiet else 1 + verbose, log_file(fleet.log, agent_id))
+        observers = observers_of(fleet, agent_id, config.parent) if agent_id in fleet.ids else []
+    except RecordError as error:
+        raise NotStarted(str(error), ExitCode.RECORD) from error
+    except ConfigError as error:
+        raise NotStarted(str(error), ExitCode.CONFIG) from error
+    except KeyFileError as error:
+        raise NotStarted(str(error), ExitCode.KEYS) from error
     announce()
     if fleet.record.directory is not None:
         try:
             keep_earlier_record(Path(fleet.record.directory), agent_id)
         except OSError as error:
             raise NotStarted(f"record {fleet.record.directory}: {error.strerror}", ExitCode.RECORD) from error
-    raise typer.Exit(run(fleet, agent_id, make_estimator, base=config.parent))
+    raise typer.Exit(run(fleet, agent_id, make_estimator, base=config.parent, observers=observers))

@@ -15,22 +15,47 @@ def register(app: typer.Typer) -> None:
 
 def check(
     config: Annotated[Path, typer.Argument(help="Configuration of a fleet (TOML).")],
+    profiles: Annotated[
+        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
+    ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
+    ] = None,
+    agent_id: Annotated[
+        int | None, typer.Option("--id", help="Check the keys of this agent only, as its drone would.")
     ] = None,
     show: Annotated[
         bool, typer.Option("--print", help="Print the effective configuration, defaults filled in.")
     ] = False,
 ) -> None:
-    """Check a configuration, its simulated scenario included; starts nothing and opens nothing."""
+    """Check a configuration, its simulated scenario and its security profile; starts nothing and opens nothing.
+
+    On the ground, where the authority's key is, the keys of every agent are checked, elsewhere those that are here.
+    """
+    import time
+
     from agent.config import dump, load_config
+    from agent.security import agents_here, expiry_warnings, security_faults
+    from fleetloc.errors import InputError
     from sim_bridge.scenario_config import scenario_from_config
 
-    fleet = load_config(config, overrides or ())
+    fleet = load_config(config, overrides or (), profiles or ())
     scenario_from_config(fleet)
     if show:
         typer.echo(dump(fleet), nl=False)
         return
+    if agent_id is not None and agent_id not in fleet.ids:
+        raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
+    base, unix_s = config.parent, time.time()
+    here = (agent_id,) if agent_id is not None else agents_here(fleet, base)
+    faults = dict.fromkeys(line for one in here for line in security_faults(fleet, one, base, unix_s=unix_s))
+    if faults:
+        for line in faults:
+            typer.echo(line, err=True)
+        expected = f"all that profile {fleet.security.profile} promises"
+        raise InputError(str(config), "security", expected, f"{len(faults)} things missing, see above")
+    for line in dict.fromkeys(line for one in here for line in expiry_warnings(fleet, one, base, unix_s=unix_s)):
+        typer.echo(f"warning: {line}", err=True)
     typer.echo(f"{config}: fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
     for table in fleet.agents:
         hears = ", ".join(map(str, fleet.neighbours(table.id))) or "nobody"

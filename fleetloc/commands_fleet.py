@@ -28,6 +28,9 @@ def fleet(
     delay_s: Annotated[float | None, typer.Option("--delay", help="Delay of every packet in s.")] = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
+    profiles: Annotated[
+        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
+    ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
     ] = None,
@@ -51,7 +54,7 @@ def fleet(
         "transport.delay_s": delay_s,
     }
     settings = [f"{key}={value}" for key, value in options.items() if value is not None]
-    fleet_config = _prepared(config, [*settings, *(overrides or ())], out, signed_keys=not lockstep)
+    fleet_config = _prepared(config, profiles or [], [*settings, *(overrides or ())], out, live=not lockstep)
     folder = Path(str(fleet_config.record.directory))
     announce()
     warm_up_everything()
@@ -69,27 +72,28 @@ def fleet(
     typer.echo(f"report: {folder / run_files.REPORT_HTML}")
 
 
-def _prepared(config: Path, settings: list[str], out: Path | None, *, signed_keys: bool) -> FleetConfig:
+def _prepared(
+    config: Path, profiles: list[Path], settings: list[str], out: Path | None, *, live: bool
+) -> FleetConfig:
     """The effective configuration, also written into the run's folder for all its processes.
 
-    Checks before anything starts: the scenario, the keys.
+    Checks before anything starts: the scenario, and for a live run what the security profile promises.
     """
     import msgspec
 
     from agent.config import dump, load_config
+    from agent.security import require
     from fleetloc import run_files
     from sim_bridge.scenario_config import scenario_from_config
-    from transport.keys import load_secret, load_trust
 
-    fleet = load_config(config, settings)
+    fleet = load_config(config, settings, profiles)
     scenario_from_config(fleet)
     # absolute, so that a daemon can be restarted from anywhere with the configuration in the folder
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     keys = (config.parent / fleet.security.keys).resolve()
-    if signed_keys and fleet.security.mode == "signed":
-        load_trust(keys, fleet.ids)
+    if live:
         for agent_id in fleet.ids:
-            load_secret(keys, agent_id)
+            require(fleet, agent_id, config.parent, unix_s=time.time())
     replace = msgspec.structs.replace
     fleet = replace(
         fleet,

@@ -18,6 +18,9 @@ def sim(
     out: Annotated[Path | None, typer.Option("--out", help="Write the truth here when it ends.")] = None,
     duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Beats sim.seed.")] = None,
+    profiles: Annotated[
+        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
+    ] = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
     ] = None,
@@ -38,7 +41,7 @@ def sim(
     settings = list(overrides or ())
     settings += [] if seed is None else [f"sim.seed={seed}"]
     settings += [] if duration_s is None else [f"sim.duration_s={duration_s}"]
-    fleet = load_config(config, settings)
+    fleet = load_config(config, settings, profiles or ())
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     report = asyncio.run(
@@ -46,6 +49,7 @@ def sim(
             fleet,
             truth_file=None if out is None else out / TRUTH,
             on_advance=TruthWriter() if truth_lines else None,
+            base=config.parent,
         )
     )
     if out is not None:

@@ -8,10 +8,9 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from agent.config_tables import FleetConfig
-from sim_bridge.simulator import range_session_settings
-from transport.auth import UNSIGNED, Trust
+from agent.security import observer_credentials, observer_session
+from transport.errors import Rejected
 from transport.estimate_body import FleetEstimate
-from transport.keys import load_trust
 from transport.opening import Opener
 from transport.report_body import Diagnostics
 from transport.session import Handlers, Session, open_session
@@ -41,10 +40,10 @@ class FleetObserver:
     """Listens to the estimates and diagnostics of every agent; ``agents`` by id."""
 
     def __init__(self, config: FleetConfig, base: Path, on_presence: Callable[[], None]) -> None:
-        """Read the public keys; raises `KeyFileError`. ``base`` is the folder that the key folder is relative to."""
+        """Read the keys; raises `SecurityError`. ``base`` is the folder that the key folder is relative to."""
         self._config = config
-        signed = config.security.mode == "signed"
-        trust: Trust = load_trust(base / config.security.keys, config.ids) if signed else UNSIGNED
+        trust, self._envelopes = observer_credentials(config, base, unix_s=time.time())
+        self._settings = observer_session(config, base)
         self._opener = Opener(config.fleet.name, config.ids, trust)
         self._told = on_presence
         self._session: Session | None = None
@@ -53,8 +52,7 @@ class FleetObserver:
     async def open(self) -> None:
         """Dial every agent; raises `SessionError`."""
         handlers = Handlers(self._on_sample, self._on_presence)
-        settings = range_session_settings(self._config)
-        session = await open_session(settings, self._config.fleet.name, None, self._config.ids, handlers)
+        session = await open_session(self._settings, self._config.fleet.name, None, self._config.ids, handlers)
         for agent_id in self._config.ids:
             session.subscribe(agent_id, (Stream.EST, Stream.DIAG))
         session.announce()
@@ -76,6 +74,11 @@ class FleetObserver:
             self._told()
 
     def _on_sample(self, key: str, payload: bytes, arrived_s: float) -> None:
+        if self._envelopes is not None:
+            try:
+                payload = self._envelopes.open(key, payload)
+            except Rejected:
+                return  # of another fleet or nobody's: not ours to show
         received = self._opener.open(key, payload, now=arrived_s, unix_ns=time.time_ns())
         if received is None:
             return  # counted by the opener

@@ -99,18 +99,24 @@ def _of_counters(lives: list[Diagnostics]) -> dict[str, Any]:
     total: Counter[str] = Counter()
     for life in lives:
         total.update(life.counters)
-    rejected = {name.removeprefix("rejected "): n for name, n in total.items() if name.startswith("rejected ")}
+    return {"packets": counted_packets(total), "sensors": counted_sensors(total)}
+
+
+def counted_packets(total: Counter[str]) -> dict[str, Any]:
+    """An agent's packets, out of its counters."""
     return {
-        "packets": {
-            "sent": total["packets sent"],
-            "received": total["packets received"],
-            "lost": total["packets lost"],
-            "injected_losses": total["injected losses"],
-            "late": total["measurements: late"] + total["information: late"],
-            "rejected": rejected,
-        },
-        "sensors": {name: _of_sensor(name, left_out, total) for name, left_out in SENSORS.items()},
+        "sent": total["packets sent"],
+        "received": total["packets received"],
+        "lost": total["packets lost"],
+        "injected_losses": total["injected losses"],
+        "late": total["measurements: late"] + total["information: late"],
+        "rejected": {name.removeprefix("rejected "): n for name, n in total.items() if name.startswith("rejected ")},
     }
+
+
+def counted_sensors(total: Counter[str]) -> dict[str, dict[str, Any]]:
+    """An agent's sensors, out of its counters."""
+    return {name: _of_sensor(name, left_out, total) for name, left_out in SENSORS.items()}
 
 
 def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config_tables import FleetConfig
+from agent.membership import is_absent
 from agent.recording import covariance_of, entry_dtype, read_record
 from estimators.consistency import nees
 from estimators.estimator import Status
@@ -28,10 +29,11 @@ class Track:
     """One agent's estimates at K ticks, those without an estimate (status "no data") left out of the errors.
 
     ``time_s`` ``(K,)`` since the start of the truth, ``own_m`` and ``own_sigma_m`` ``(K, 3)`` NED position and
-    1-sigma, ``own_error_m`` ``(K, 3)``, ``full_error`` ``(K, 6n)``, ``nees`` ``(K,)`` over the fleet state divided by
-    its dimension (NaN where the covariance is none), ``latency_s`` ``(K,)`` from a tick's end to its estimate,
-    ``tick_time_s`` ``(K,)`` of computation, ``on_time`` ``(K,)`` whether it was out within one period of the tick's
-    end, ``known`` ``(K,)`` whether there was an estimate.
+    1-sigma, ``own_error_m`` ``(K, 3)``, ``full_error`` ``(K, 6n)`` (zero for drones that were no part of the
+    estimate), ``nees`` ``(K,)`` over the states of those who were, divided by their number (NaN where the covariance
+    is none), ``latency_s`` ``(K,)`` from a tick's end to its estimate, ``tick_time_s`` ``(K,)`` of computation,
+    ``on_time`` ``(K,)`` whether it was out within one period of the tick's end, ``known`` ``(K,)`` whether there was
+    an estimate.
     """
 
     agent_id: int
@@ -81,6 +83,8 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     own = position(Layout(config.ids).slot(agent_id))
     when = np.clip(epoch_s + entries["t_s"], truth.time_unix_s[0], truth.time_unix_s[-1])
     error = entries["mean"] - truth.at(when).reshape(len(entries), STATES_PER_AGENT * len(config.ids))
+    absent = np.repeat(is_absent(entries["age_ticks"]), STATES_PER_AGENT, axis=1)
+    error[absent] = 0.0  # nothing is said of them
     known = np.asarray(entries["status"] != Status.NO_DATA)
     covariance_diagonal = np.array([covariance_of(entry, len(config.ids)).diagonal()[own] for entry in entries])
     latency_s = entries["published_s"] - entries["t_s"] - period_s
@@ -103,9 +107,11 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
 
 
 def _nees(entry: np.void, error: Floats) -> float:
-    covariance = covariance_of(entry, len(error) // STATES_PER_AGENT)
+    """Of those who are part of the estimate, over the dimension of their states."""
+    present = np.repeat(~is_absent(entry["age_ticks"]), STATES_PER_AGENT)
+    covariance = covariance_of(entry, len(error) // STATES_PER_AGENT)[np.ix_(present, present)]
     try:
-        return nees(error, covariance) / len(error)
+        return nees(error[present], covariance) / max(int(present.sum()), 1)
     except np.linalg.LinAlgError:
         return NO_STATISTICS
 

@@ -43,7 +43,7 @@ AXES = ("north", "east", "down")
 Drawing = Callable[Given, Figure]
 
 
-def _styled(draw: Drawing[Given]) -> Callable[Given, str]:
+def styled(draw: Drawing[Given]) -> Callable[Given, str]:
     """Draw in this report's style; the drawing as SVG."""
 
     @functools.wraps(draw)
@@ -59,10 +59,10 @@ def colour(slot: int) -> str:
     return COLOURS[slot % len(COLOURS)]
 
 
-@_styled
+@styled
 def trajectories(results: Results) -> Figure:
     """Top view and height over time: the truth pale and wide, what each drone believes of itself thin on top."""
-    figure = _figure(4.6)
+    figure = figure_of(4.6)
     above, beside = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.25)})
     time_s = results.truth.time_unix_s - results.start_unix_s
     for slot, track in enumerate(results.tracks):
@@ -75,7 +75,7 @@ def trajectories(results: Results) -> Figure:
         beside.plot(when, -down, color=colour(slot), linewidth=0.9)
     everything = results.truth.position_m.reshape(-1, 3)
     _frame(above, everything[:, 1], everything[:, 0])
-    beside.set_ylim(*_span(-everything[:, 2]))
+    beside.set_ylim(*span_of(-everything[:, 2]))
     above.set(title="seen from above", xlabel="east m", ylabel="north m")
     beside.set(title="height above the origin", xlabel="time s", ylabel="m", xlim=(0, results.duration_s))
     above.set_aspect("equal", adjustable="box")
@@ -83,11 +83,11 @@ def trajectories(results: Results) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def errors(config: FleetConfig, results: Results) -> Figure:
     """Own position error per axis within its 3-sigma band, one row per drone; GPS outages are shaded."""
     count = len(results.tracks)
-    figure = _figure(0.6 + 1.7 * count)
+    figure = figure_of(0.6 + 1.7 * count)
     grid = figure.subplots(count, 3, sharex=True, squeeze=False)
     for slot, (row, track) in enumerate(zip(grid, results.tracks, strict=True)):
         limits_m = [_error_limit_m(track, axes) for axes in (slice(0, 2), slice(0, 2), slice(2, 3))]
@@ -107,10 +107,10 @@ def errors(config: FleetConfig, results: Results) -> Figure:
     return figure
 
 
-@_styled
+@styled
 def consistency(results: Results) -> Figure:
     """NEES of the fleet state over its dimension, logarithmic, with the band that holds 95 % of samples."""
-    figure = _figure(3.2)
+    figure = figure_of(3.2)
     axes = figure.subplots()
     low, high = average_nees_band(STATES_PER_AGENT * len(results.tracks), 1)
     axes.axhspan(low, high, color="#888888", alpha=0.18, linewidth=0, label=BAND)
@@ -119,15 +119,15 @@ def consistency(results: Results) -> Figure:
         when, values = _columns(track, results, track.nees)
         axes.plot(when, values, color=colour(slot), linewidth=0.8, label=f"drone {track.agent_id}")
     axes.set(yscale="log", xlim=(0, results.duration_s), xlabel="time s", ylabel="NEES / dimension")
-    _plain_log(axes)
+    plain_log(axes)
     figure.legend(loc="outside lower center", ncols=6)
     return figure
 
 
-@_styled
+@styled
 def timing(results: Results) -> Figure:
     """When each tick's estimate was out, against its deadline, and how the computing times are distributed."""
-    figure = _figure(3.4)
+    figure = figure_of(3.4)
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1.6, 1)})
     for slot, track in enumerate(results.tracks):
         latency_ms, label = 1e3 * track.latency_s, f"drone {track.agent_id}"
@@ -151,17 +151,17 @@ def timing(results: Results) -> Figure:
     distribution.set(title="computing time of a tick", xlabel="ms", ylabel="% of ticks at most", ylim=(0, 101))
     if distribution.lines:
         distribution.set_xscale("log")
-        _plain_log(distribution, axis="x")
+        plain_log(distribution, axis="x")
     else:
         distribution.annotate("not measured in virtual time", (0.5, 0.5), xycoords="axes fraction", ha="center")
     figure.legend(loc="outside lower center", ncols=min(len(results.tracks), 8), markerscale=4)
     return figure
 
 
-@_styled
+@styled
 def packets(agents: Sequence[dict[str, Any]]) -> Figure:
     """Packets per drone: what came in, and what did not come, came late or was refused."""
-    figure = _figure(2.8)
+    figure = figure_of(2.8)
     traffic, trouble = figure.subplots(1, 2)
     names = [f"drone {agent['id']}" for agent in agents]
     of = [agent["packets"] for agent in agents]
@@ -183,7 +183,8 @@ def packets(agents: Sequence[dict[str, Any]]) -> Figure:
 # --- parts --------------------------------------------------------------------------------------------------
 
 
-def _figure(height_in: float) -> Figure:
+def figure_of(height_in: float) -> Figure:
+    """An empty figure of the page's width."""
     return Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
 
 
@@ -211,7 +212,8 @@ def _error_limit_m(track: Track, axes: slice) -> float:
     return float(1.2 * np.percentile(reach, 95))
 
 
-def _span(values: Floats) -> tuple[float, float]:
+def span_of(values: Floats) -> tuple[float, float]:
+    """Limits that show all values with a margin."""
     low, high = float(values.min()), float(values.max())
     margin = 0.08 * max(high - low, 1.0)
     return low - margin, high + margin
@@ -219,11 +221,11 @@ def _span(values: Floats) -> tuple[float, float]:
 
 def _frame(axes: Axes, x: Floats, y: Floats) -> None:
     """Show the truth with a margin; an estimate that is far off at its start runs out of the picture."""
-    axes.set_xlim(*_span(x))
-    axes.set_ylim(*_span(y))
+    axes.set_xlim(*span_of(x))
+    axes.set_ylim(*span_of(y))
 
 
-def _plain_log(axes: Axes, axis: str = "y") -> None:
+def plain_log(axes: Axes, axis: str = "y") -> None:
     """Tick labels 0.1, 1, 10 in place of powers."""
     chosen = axes.yaxis if axis == "y" else axes.xaxis
     chosen.set_major_formatter(FuncFormatter(lambda value, _place: f"{value:g}"))

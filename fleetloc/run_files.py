@@ -1,17 +1,18 @@
 """The files of a run in its folder: who writes which, and how several records of one agent are told apart.
 
-===========================  ==================================================================
-``fleet.toml``               the effective configuration; every process of the run reads this one
-``truth.npz``                where every drone truly was (`sim_bridge.truth`)
-``agent_001.estimates``      the last record of agent 1 (`agent.recording`)
-``agent_001.1.estimates``    the record before it, if the daemon was restarted; ``.2`` the next, ...
-``agent_001.json``           counters of its last daemon, likewise
-``agent_001.log``            what the daemon said on stderr
-``simulator.log``            what the simulator said
-``simulator.json``           how its run went (`sim_bridge.simulator.SimulatorReport`)
-``report.json``              figures
-``report.html``              the same for people, with plots
-===========================  ==================================================================
+=============================  ====================================================================
+``fleet.toml``                 the effective configuration; every process of the run reads this one
+``truth.npz``                  where every drone truly was (`sim_bridge.truth`)
+``agent_001.estimates``        the last record of agent 1 (`agent.recording`)
+``agent_001.1.estimates``      the record before it, if the daemon was restarted; ``.2`` the next, ...
+``agent_001.mcap``, ``.tlog``  the flight record of its last daemon (`agent.flight_record`), likewise
+``agent_001.json``             counters of its last daemon, likewise
+``agent_001.log``              what the daemon said on stderr
+``simulator.log``              what the simulator said
+``simulator.json``             how its run went (`sim_bridge.simulator.SimulatorReport`)
+``report.json``                figures
+``report.html``                the same for people, with plots
+=============================  ====================================================================
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ from agent.recording import SUFFIX
 CONFIG, TRUTH, REPORT_JSON, REPORT_HTML = "fleet.toml", "truth.npz", "report.json", "report.html"
 SIMULATOR_LOG, SIMULATOR_JSON = "simulator.log", "simulator.json"
 SUMMARY_SUFFIX = ".json"
-_OF_A_RUN = re.compile(r"agent_[0-9]{3}(\.[0-9]+)?\.(estimates|json|log)")
+BESIDE_SUFFIXES = (SUMMARY_SUFFIX, ".tlog", ".mcap")
+"""What goes with a record and keeps its number."""
+_OF_A_RUN = re.compile(r"agent_[0-9]{3}(\.[0-9]+)?\.(estimates|json|log|tlog|mcap)")
 
 
 def record_path(directory: Path, agent_id: int) -> Path:
@@ -48,9 +51,9 @@ def keep_earlier_record(directory: Path, agent_id: int) -> None:
         return
     number = next(n for n in itertools.count(1) if not _numbered(record, n).exists())
     record.rename(_numbered(record, number))
-    summary = record.with_suffix(SUMMARY_SUFFIX)
-    if summary.exists():
-        summary.rename(_numbered(summary, number))
+    for beside in (record.with_suffix(suffix) for suffix in BESIDE_SUFFIXES):
+        if beside.exists():
+            beside.rename(_numbered(beside, number))
 
 
 def records(directory: Path, agent_id: int) -> list[Path]:

@@ -10,19 +10,17 @@ from agent.config_tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.frames import FleetFrame
 from agent.mavlink_samples import SampleAdapter
+from agent.radio_faults import channel_settings
 from agent.samples import AttitudeSample, GpsSample, ImuSample, Sample
 from agent.uwb import UwbAdapter
 from transport.auth import UNSIGNED
-from transport.channel import Channel, ChannelSettings
+from transport.channel import Channel, Outage
 from transport.header import Kind
 from transport.information_body import Information
 from transport.opening import Opener, Received
 from transport.sealing import Message, Sealer
 from transport.streams import key_expression
 from transport.uwb_body import UwbFrame
-
-BOOT = 1
-"""Start number of every agent; nothing that is recorded depends on it."""
 
 Parcel = Any
 """What a member packs and another unpacks: a key with bytes, or a `Received`."""
@@ -33,15 +31,31 @@ class Member(ABC):
 
     def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory) -> None:
         self.agent_id = agent_id
+        self._config = config
         self.core = AgentCore(config, agent_id, make_estimator)
         self.uwb = UwbAdapter(agent_id, config.ids, config.sensors)
-        transport = config.transport
-        faults = ChannelSettings(
-            loss=transport.loss, delay_s=transport.delay_s, delay_exponential_s=transport.delay_jitter_s
+        self.channel = self._channel((), None)
+
+    def set_outages(self, outages: tuple[Outage, ...], began_s: float) -> None:
+        """What it cannot hear besides the configured faults, whose times count from ``began_s``.
+
+        Before anything is offered to the channel.
+        """
+        self.channel = self._channel(outages, began_s)
+
+    def _channel(self, outages: tuple[Outage, ...], began_s: float | None) -> Channel[Parcel]:
+        transport = self._config.transport
+        faults = channel_settings(
+            transport.faults,
+            self.agent_id,
+            loss=transport.loss,
+            delay_s=transport.delay_s,
+            delay_jitter_s=transport.delay_jitter_s,
+            began_s=began_s,
+            more=outages,
         )
-        self.channel: Channel[Parcel] = Channel.seeded(
-            faults, seed=transport.seed, receiver=agent_id, neighbours=config.neighbours(agent_id)
-        )
+        neighbours = self._config.neighbours(self.agent_id)
+        return Channel.seeded(faults, seed=transport.seed, receiver=self.agent_id, neighbours=neighbours)
 
     @abstractmethod
     def pack(self, message: Message, unix_ns: int) -> list[Parcel]:
@@ -64,10 +78,9 @@ class Member(ABC):
         elif isinstance(sample, GpsSample):
             self.core.on_gps(sample, now_s)
 
-    def _common_counters(self, samples: SampleAdapter) -> dict[str, int]:
+    def _common_counters(self) -> dict[str, int]:
         counters = {"injected losses": sum(self.channel.lost.values()), **self.core.counters}
         for prefix, table in (
-            ("skipped ", samples.skipped),
             ("skipped ", self.core.timeline.skipped),
             ("skipped uwb ", self.uwb.skipped),
             ("refused ", self.core.records.refused),
@@ -77,33 +90,14 @@ class Member(ABC):
         return counters
 
 
-class ValueMember(Member):
-    """Takes samples, fixes and packets as objects; ``start_fleet_s`` is the fleet time of stamp zero."""
+class ObjectMember(Member):
+    """Hands packets over as objects; its samples come ready made, as from the replay of a log."""
 
-    def __init__(
-        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, start_fleet_s: float
-    ) -> None:
+    def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory) -> None:
         super().__init__(config, agent_id, make_estimator)
         self.core.autopilot_state = str(LinkState.CONNECTED)
-        self._samples = SampleAdapter(
-            FleetFrame.of(config),
-            config.sensors,
-            config.fleet.epoch_unix_s,
-            lambda boot_s, _arrival_s: start_fleet_s + boot_s,
-        )
         self._sent = 0
         self._received = 0
-
-    def on_fix(self, message: Any, now_s: float) -> None:
-        """A GPS_RAW_INT message; ``now_s`` fleet time."""
-        sample = self._samples.convert(message, now_s)
-        if sample is not None:
-            self.on_sample(sample, now_s)
-
-    def on_uwb(self, frame: UwbFrame, age_s: float, now_s: float) -> None:
-        """A frame of the own UWB module; ``now_s`` fleet time."""
-        for sample in self.uwb.samples_of(frame, age_s, now_s):
-            self.core.on_range(sample, now_s)
 
     def pack(self, message: Message, unix_ns: int) -> list[Parcel]:
         self._sent += 1
@@ -117,21 +111,58 @@ class ValueMember(Member):
 
     def counters(self) -> dict[str, int]:
         counted = {"packets sent": self._sent, "packets received": self._received}
-        return counted | self._common_counters(self._samples)
+        return counted | self._common_counters()
+
+
+class ValueMember(ObjectMember):
+    """Takes samples, fixes and packets as objects; ``start_fleet_s`` is the fleet time of stamp zero."""
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, start_fleet_s: float
+    ) -> None:
+        super().__init__(config, agent_id, make_estimator)
+        self._samples = SampleAdapter(
+            FleetFrame.of(config),
+            config.sensors,
+            config.fleet.epoch_unix_s,
+            lambda boot_s, _arrival_s: start_fleet_s + boot_s,
+        )
+
+    def on_fix(self, message: Any, now_s: float) -> None:
+        """A GPS_RAW_INT message; ``now_s`` fleet time."""
+        sample = self._samples.convert(message, now_s)
+        if sample is not None:
+            self.on_sample(sample, now_s)
+
+    def on_uwb(self, frame: UwbFrame, age_s: float, now_s: float) -> None:
+        """A frame of the own UWB module; ``now_s`` fleet time."""
+        for sample in self.uwb.samples_of(frame, age_s, now_s):
+            self.core.on_range(sample, now_s)
+
+    def counters(self) -> dict[str, int]:
+        return super().counters() | _skipped(self._samples)
 
 
 class ByteMember(Member):
-    """Speaks MAVLink with its fake autopilot and seals and opens packets as the daemon does."""
+    """Speaks MAVLink with its fake autopilot, seals and opens packets as the daemon does.
+
+    ``boot`` counts its starts.
+    """
 
     def __init__(
-        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, fleet_offset_s: float
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        make_estimator: EstimatorFactory,
+        fleet_offset_s: float,
+        boot: int = 1,
     ) -> None:
         super().__init__(config, agent_id, make_estimator)
         self._fleet = config.fleet.name
         self._fleet_offset_s = fleet_offset_s
         self._session = AutopilotSession(config, agent_id, datagrams=True)
         self._session.fleet_offset_s = fleet_offset_s
-        self._sealer = Sealer(self._fleet, agent_id, boot=BOOT, signing=UNSIGNED)
+        self._sealer = Sealer(self._fleet, agent_id, boot=boot, signing=UNSIGNED)
         freshness_s = config.security.freshness_s
         self._opener = Opener(self._fleet, config.ids, UNSIGNED, own_id=agent_id, freshness_s=freshness_s)
         self._double = {"auto": None, "float32": False, "float64": True}[config.transport.information_format]
@@ -174,4 +205,9 @@ class ByteMember(Member):
             "packets lost": sum(peer.lost for peer in peers),
         }
         rejected = {f"rejected {name}": count for name, count in self._opener.peers.rejections().items()}
-        return counted | self._common_counters(self._session.samples) | rejected
+        return counted | self._common_counters() | _skipped(self._session.samples) | rejected
+
+
+def _skipped(samples: SampleAdapter) -> dict[str, int]:
+    """Counters of the messages that gave no sample."""
+    return {f"skipped {reason}": count for reason, count in samples.skipped.items()}

@@ -20,7 +20,7 @@ from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 from agent.frames import FleetFrame
 from agent.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Quaternion, Triple
@@ -37,6 +37,9 @@ class LogError(ValueError):
         self.path = str(path)
         self.expected = expected
         self.found = found
+
+    def __reduce__(self) -> tuple[type[LogError], tuple[str, str, str], dict[str, Any]]:
+        return type(self), (self.path, self.expected, self.found), self.__dict__
 
 
 @dataclass(frozen=True, slots=True)
@@ -159,7 +162,10 @@ class LogCounts:
 
 
 class LogSource(Protocol):
-    """One log file. Reading it again gives the same events; `counts` are those of the last reading."""
+    """One log file. Reading it again gives the same events."""
+
+    counts: LogCounts
+    """Of the last reading, complete once `events` is exhausted."""
 
     @property
     def path(self) -> Path:
@@ -172,10 +178,6 @@ class LogSource(Protocol):
     @property
     def frame(self) -> FleetFrame:
         """The frame of positions: the one given, or about the log's own origin or first fix."""
-
-    @property
-    def counts(self) -> LogCounts:
-        """Complete once `events` is exhausted."""
 
     def survey(self) -> LogSurvey:
         """One pass over the whole log, made once and kept; raises `LogError`."""

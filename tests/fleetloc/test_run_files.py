@@ -20,18 +20,22 @@ def test_restarts_keep_every_record_in_order(tmp_path: Path) -> None:
     assert records(tmp_path, 1) == []
 
 
-def test_the_counters_go_with_their_record(tmp_path: Path) -> None:
+def test_counters_and_flight_record_go_with_their_record(tmp_path: Path) -> None:
     record_path(tmp_path, 1).write_text("")
-    (tmp_path / "agent_001.json").write_text("first")
+    beside = [".json", ".tlog", ".mcap"]
+    for suffix in beside:
+        (tmp_path / f"agent_001{suffix}").write_text("first")
     keep_earlier_record(tmp_path, 1)
-    assert (tmp_path / "agent_001.1.json").read_text() == "first"
-    assert not (tmp_path / "agent_001.json").exists()
+    for suffix in beside:
+        assert (tmp_path / f"agent_001.1{suffix}").read_text() == "first"
+        assert not (tmp_path / f"agent_001{suffix}").exists()
 
 
 def test_clearing_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> None:
     folder = tmp_path / "new" / "run"
     clear(folder)
     written = ["agent_001.estimates", "agent_001.2.estimates", "agent_001.json", "agent_001.log", "truth.npz"]
+    written += ["agent_001.mcap", "agent_001.2.tlog"]
     kept = ["notes.txt", "agent_plan.json", "figures.json"]
     for name in written + kept:
         (folder / name).write_text("")

@@ -42,16 +42,17 @@ def signed(tmp_path: Path) -> Path:
 def test_keys_from_first_to_last(signed: Path, capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["keys", "init", str(signed)]) == 0
     first = capsys.readouterr().out.splitlines()
-    assert [line.split()[:4] for line in first] == [["agent", str(i), "secret", "here"] for i in (1, 2, 3)]
+    assert [line.split()[:4] for line in first[:3]] == [["agent", str(i), "secret", "here"] for i in (1, 2, 3)]
+    assert [line.split()[0] for line in first[3:]] == ["authority", "observer", "group"]
     assert stat.S_IMODE((signed.parent / "keys" / "agent_002.key").stat().st_mode) == 0o600
     assert cli.main(["keys", "rotate", str(signed), "--id", "2"]) == 0
-    rotated = capsys.readouterr().out.split()
-    assert rotated[-1] == first[1].split()[-1]  # the old one is accepted still
+    rotated = capsys.readouterr().out.splitlines()[1].split()
+    assert rotated[5] == first[1].split()[4]  # the old one is accepted still
     assert cli.main(["keys", "retire", str(signed), "--id", "2"]) == 0
     capsys.readouterr()
     assert cli.main(["keys", "list", str(signed)]) == 0
     listed = capsys.readouterr().out.splitlines()
-    assert listed[1].split()[-1] == rotated[-2]
+    assert listed[1].split()[4:6] == [rotated[4], "certificate"]
     assert (listed[0], listed[2]) == (first[0], first[2])
 
 

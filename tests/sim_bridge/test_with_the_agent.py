@@ -32,7 +32,7 @@ class Run:
                     "epoch_unix_s": EPOCH_S,
                 },
                 "agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:14551", "autopilot": flavour}],
-                "sensors": {"gps_speed": "norm"},
+                "sensors": {"gps_speed": "norm", "imu_latency_s": 0.0},
                 "mavlink": {"attitude_hz": sim.get("attitude_hz", 50.0)},
                 "sim": sim,
             },

@@ -1,0 +1,124 @@
+"""``fleetloc ranges``: what measured ranges are like, pair by pair, against true distances."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from fleetloc.errors import InputError
+from fleetloc.output import print_table, write_json
+from sim_bridge.replay.range_files import RangeCounts, read_ranges
+
+Floats = NDArray[np.float64]
+NORMAL_OF_MAD = 1.4826
+"""1-sigma of a normal distribution by its median absolute deviation."""
+
+
+@dataclass(frozen=True, slots=True)
+class PairFigures:
+    """Errors (measured less true, m) of one pair, whoever measured.
+
+    ``sigma_m`` is robust: 1.4826 times the median distance from the median. ``outliers`` is the share that lies
+    further than a limit from the pair's median.
+    """
+
+    pair: tuple[int, int]
+    count: int
+    bias_m: float
+    median_m: float
+    sigma_m: float
+    outliers: float
+    worst_m: float
+
+
+def pair_figures(pair: tuple[int, int], errors_m: Floats, outlier_m: float) -> PairFigures:
+    """Figures of the errors ``(K,)`` of one pair, K at least 1."""
+    median_m = float(np.median(errors_m))
+    off_m = np.abs(errors_m - median_m)
+    return PairFigures(
+        pair=pair,
+        count=len(errors_m),
+        bias_m=float(errors_m.mean()),
+        median_m=median_m,
+        sigma_m=NORMAL_OF_MAD * float(np.median(off_m)),
+        outliers=float(np.mean(off_m > outlier_m)),
+        worst_m=float(off_m.max()),
+    )
+
+
+def study_ranges(file: Path, outlier_m: float, json_file: Path | None) -> dict[str, Any]:
+    """Print bias, robust sigma and outliers per pair; returns what goes into the JSON file.
+
+    Raises `InputError` or `ReplayError` for a file without ranges or without true distances.
+    """
+    counts = RangeCounts()
+    errors: dict[tuple[int, int], list[float]] = {}
+    for line in read_ranges(file, counts):
+        if line.true_m is None:
+            counts.skipped["no true distance"] += 1
+            continue
+        pair = min(line.observer, line.target), max(line.observer, line.target)
+        errors.setdefault(pair, []).append(line.range_m - line.true_m)
+    if not errors:
+        raise InputError(str(file), "true_m", "a column of true distances (true_m, mocap_range or truth)", "none")
+    pairs = [pair_figures(pair, np.array(values), outlier_m) for pair, values in sorted(errors.items())]
+    figures = {
+        "file": file.name,
+        "lines_read": counts.read,
+        "lines_skipped": dict(counts.skipped),
+        "first_bad_lines": counts.lines,
+        "outlier_limit_m": outlier_m,
+        "pairs": [
+            {
+                "pair": list(one.pair),
+                "count": one.count,
+                "bias_m": one.bias_m,
+                "median_m": one.median_m,
+                "robust_sigma_m": one.sigma_m,
+                "outlier_fraction": one.outliers,
+                "worst_from_median_m": one.worst_m,
+            }
+            for one in pairs
+        ],
+        "bias_mean_m": float(np.mean([one.bias_m for one in pairs])),
+        "bias_spread_m": float(np.std([one.bias_m for one in pairs])),
+        "robust_sigma_median_m": float(np.median([one.sigma_m for one in pairs])),
+    }
+    _print(figures, pairs, counts)
+    if json_file is not None:
+        write_json(json_file, figures)
+    return figures
+
+
+def _of_all(figures: dict[str, Any]) -> list[str]:
+    spread = f"{figures['bias_mean_m']:+.3f} ({figures['bias_spread_m']:.3f} apart)"
+    return [spread, "", f"{figures['robust_sigma_median_m']:.3f}", "", ""]
+
+
+def _print(figures: dict[str, Any], pairs: list[PairFigures], counts: RangeCounts) -> None:
+    limit = f"> {figures['outlier_limit_m']:g} m off %"
+    columns = ["pair", "ranges", "bias m", "median m", "robust sigma m", limit, "worst m"]
+    rows = [
+        [
+            f"{one.pair[0]} - {one.pair[1]}",
+            str(one.count),
+            f"{one.bias_m:+.3f}",
+            f"{one.median_m:+.3f}",
+            f"{one.sigma_m:.3f}",
+            f"{100 * one.outliers:.2f}",
+            f"{one.worst_m:.2f}",
+        ]
+        for one in pairs
+    ]
+    rows.append(["all", str(sum(one.count for one in pairs)), *_of_all(figures)])
+    print_table(columns, rows, title="measured less true distance")
+    if counts.skipped:
+        rows = [
+            [reason, str(n), ", ".join(map(str, counts.lines.get(reason, []))) or "-"]
+            for reason, n in counts.skipped.items()
+        ]
+        print_table(["lines left out", "number", "first at line"], rows)

@@ -99,7 +99,14 @@ def _of_counters(lives: list[Diagnostics]) -> dict[str, Any]:
     total: Counter[str] = Counter()
     for life in lives:
         total.update(life.counters)
-    return {"packets": counted_packets(total), "sensors": counted_sensors(total)}
+    sensors = counted_sensors(total)
+    if lives:  # of the last daemon: the latency that it assumes, or has estimated on line
+        gauges = lives[-1].gauges
+        sensors["gps"] |= {
+            "latency_s": gauges.get("gps_latency_s"),
+            "latency_sigma_s": gauges.get("gps_latency_sigma_s"),
+        }
+    return {"packets": counted_packets(total), "sensors": sensors}
 
 
 def counted_packets(total: Counter[str]) -> dict[str, Any]:
@@ -120,7 +127,7 @@ def counted_sensors(total: Counter[str]) -> dict[str, dict[str, Any]]:
 
 
 def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:
-    """Samples used and not; the delay of simulated sensors is what the configuration says, nothing is measured."""
+    """Samples used and not."""
     wrong_time = total[f"{name}: wrong time"]
     skipped = sum(n for key, n in total.items() if key.startswith(f"skipped {left_out}"))
     return {

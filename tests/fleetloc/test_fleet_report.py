@@ -121,10 +121,13 @@ def test_use_of_the_machine_is_the_one_measured_from_outside(figures: dict[str, 
 
 def test_the_summary_of_the_last_daemon_beats_what_was_heard_of_it(tmp_path: Path) -> None:
     config = make_run(tmp_path)
-    summary = {"state": "ok", "counters": {"packets sent": 7}, "gauges": {"rss_mb": 99.0}}
+    summary: dict[str, Any] = {"state": "ok", "counters": {"packets sent": 7}, "gauges": {"rss_mb": 99.0}}
+    summary["gauges"] |= {"gps_latency_s": 0.09, "gps_latency_sigma_s": 0.02}
     (tmp_path / "agent_001.json").write_bytes(msgspec.json.encode(summary))
     figures = report_figures(config, load_results(config, tmp_path), tmp_path, outcome(), "live")
     assert figures["agents"][0]["packets"]["sent"] == 107
+    gps = figures["agents"][0]["sensors"]["gps"]
+    assert (gps["latency_s"], gps["latency_sigma_s"]) == (0.09, 0.02)
 
 
 def test_report_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -14,8 +14,10 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.compiled import entry, kernel
 from estimators.estimator import symmetrised
-from estimators.layout import STATES_PER_AGENT, block
+from estimators.layout import STATES_PER_AGENT
+from estimators.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
 from estimators.measurements import Matrix, Vector
 
 WORTHWHILE_NATS = 0.2
@@ -28,23 +30,47 @@ def inherit(
     """The own information pair, with the agents that ``other`` knows better taken from there.
 
     ``slot`` is the own place, which is never taken. Pairs as in `estimators.estimator.Payload`.
+    Nothing is taken where one of them turns out not to be positive definite.
     """
-    covariance, other_covariance = symmetrised(np.linalg.inv(own[0])), symmetrised(np.linalg.inv(other[0]))
-    better = [
-        k
-        for k in range(len(own[1]) // STATES_PER_AGENT)
-        if k != slot and _log_det(covariance, k) - _log_det(other_covariance, k) > threshold
-    ]
-    if not better:
+    better = np.empty(len(own[1]) // STATES_PER_AGENT, np.bool_)
+    sound = _find_better(np.ascontiguousarray(own[0]), np.ascontiguousarray(other[0]), threshold, better)
+    better[slot] = False
+    if not sound or not better.any():
         return own
-    taken = np.zeros(len(own[1]), bool)
-    for k in better:
-        taken[block(k)] = True
-    return _transplant(own, other, covariance, taken)
+    return _transplant(own, other, symmetrised(np.linalg.inv(own[0])), np.repeat(better, STATES_PER_AGENT))
 
 
+@entry("boolean(float64[:, ::1], float64[:, ::1], float64, boolean[::1])")
+def _find_better(
+    own: Matrix, other: Matrix, threshold: float, better: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> bool:
+    """Which agents' marginals the other information matrix knows better; False where one is not positive definite."""
+    n = own.shape[0]
+    covariance, other_covariance = np.empty((n, n)), np.empty((n, n))
+    for information, inverse in ((own, covariance), (other, other_covariance)):
+        root = information.copy()
+        if not factor_upper(root):
+            return False
+        inverse_from_cholesky(root, inverse)
+    for k in range(better.shape[0]):
+        gained = _log_det(covariance, k) - _log_det(other_covariance, k)
+        if np.isnan(gained):
+            return False
+        better[k] = gained > threshold
+    return True
+
+
+@kernel
 def _log_det(covariance: Matrix, slot: int) -> float:
-    return float(np.linalg.slogdet(covariance[block(slot), block(slot)])[1])
+    """Log determinant of an agent's block; NaN where it is not positive definite."""
+    at = STATES_PER_AGENT * slot
+    root = covariance[at : at + STATES_PER_AGENT, at : at + STATES_PER_AGENT].copy()
+    if not cholesky_upper(root):
+        return np.nan
+    total = 0.0
+    for i in range(STATES_PER_AGENT):
+        total += np.log(root[i, i])
+    return 2.0 * total
 
 
 def _transplant(

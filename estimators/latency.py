@@ -31,26 +31,21 @@ from dataclasses import dataclass
 from enum import Enum, auto
 
 import numpy as np
-import numpy.typing as npt
 from scipy.interpolate import CubicSpline
 
-Vector = npt.NDArray[np.float64]
-Matrix = npt.NDArray[np.float64]
+from estimators.latency_kernels import HALF_S, STATES, fill_integrals, move_bank, update_bank
+from estimators.measurements import Matrix, Vector
+
 Pair = tuple[float, float]
 """North and east."""
 
 P, V, B = slice(0, 2), slice(2, 4), slice(4, 6)
-PSI, STATES = 6, 7
 GRID_SIGMAS, GRID_POINTS, FINE_POINTS = 3.0, 13, 121
 """The grid of latencies spans so many sigma of the prior to either side; its log weights are interpolated."""
-GATE = 13.816
-"""99.9 % of chi-square with two degrees of freedom."""
 REJECTED_IN_A_ROW = 5
 """After as many the receiver has moved for good (a jump), not erred: its quantity starts anew from the fix."""
 LOST_AFTER_S = 2.0
 """Longer without a fix, position and velocity start anew; what is known of the latency stays."""
-SMOOTH_S = 0.5
-HALF_S = SMOOTH_S / 2
 STANDS_OUT = 4.6
 """An acceleration is a manoeuvre as far as its square exceeds so many error variances (90 % of chi-square)."""
 ROUNDING_S = 1e-6
@@ -133,20 +128,9 @@ class AccelerationHistory:
         of the next one. What noise adds from one instant to the next would tell the latencies of the grid apart by
         chance; true accelerations of a drone hardly change within the average.
         """
-        table = self._pieces()
-        edges, accel = np.append(table[0, 0], table[:, 1]), table[:, 2:4]
-        w = (table[:, 1] - table[:, 0])[:, None]
-        once = _summed(w * accel)
-        twice = _summed(w * (once[:-1] + w / 2 * accel))
-        thrice = _summed(w * (twice[:-1] + w / 2 * (once[:-1] + w / 3 * accel)))
-        times = np.stack((from_s - HALF_S, from_s + HALF_S, to_s - HALF_S, to_s + HALF_S))
-        index = np.clip(np.searchsorted(edges, times, side="right") - 1, 0, len(accel) - 1)
-        u = (times - edges[index])[..., None]
-        second = twice[index] + u * (once[index] + u / 2 * accel[index])
-        third = thrice[index] + u * (twice[index] + u / 2 * (once[index] + u / 3 * accel[index]))
-        velocity_from, velocity_to = (second[1] - second[0]) / SMOOTH_S, (second[3] - second[2]) / SMOOTH_S
-        position_from, position_to = (third[1] - third[0]) / SMOOTH_S, (third[3] - third[2]) / SMOOTH_S
-        return velocity_to - velocity_from, position_to - position_from - (to_s - from_s)[:, None] * velocity_from
+        gained, moved = np.empty((len(from_s), 2)), np.empty((len(from_s), 2))
+        fill_integrals(self._pieces(), from_s, to_s, gained, moved)
+        return gained, moved
 
     def excitation(self, about_s: float) -> tuple[float, float]:
         """How far the acceleration about an instant stands out of the whole history's mean, squared in (m/s2)2.
@@ -170,11 +154,6 @@ class AccelerationHistory:
         if self._table is None:
             self._table = np.array(self._rows)
         return self._table
-
-
-def _summed(steps: Matrix) -> Matrix:
-    """Running sums ``(k + 1, 2)`` of ``(k, 2)``, from zero."""
-    return np.concatenate((np.zeros((1, 2)), np.cumsum(steps, axis=0)))
 
 
 class LatencyEstimator:
@@ -276,28 +255,21 @@ class LatencyEstimator:
         """Move each filter on from the last fix's instant to this one's, as it believes them to be."""
         duration_s = fix.stamp_s - last_s
         gained, moved = self.history.integrals(last_s - self.grid_s, fix.stamp_s - self.grid_s)
-        transition = np.eye(STATES)
-        transition[0, 2] = transition[1, 3] = duration_s
-        transition[0, 4] = transition[1, 5] = -0.5 * duration_s * duration_s
-        transition[2, 4] = transition[3, 5] = -duration_s
         kept = np.exp(-self._rate * duration_s)
-        transition[range(4, STATES), range(4, STATES)] = kept
-        psi = self.means[:, PSI : PSI + 1].copy()
-        self.means = self.means @ transition.T
-        self.means[:, P] += moved + psi * _turned(moved)
-        self.means[:, V] += gained + psi * _turned(gained)
-        transition[P, PSI] = _turned(self._weights @ moved)
-        transition[V, PSI] = _turned(self._weights @ gained)
-        covariance = transition @ self.covariance @ transition.T
         grown = self.history.velocity_density() * duration_s
         wander = 2.0 * fix.position_variance_m2 / self._model.wander_s * duration_s
-        for axis in (0, 1):
-            covariance[axis, axis] += wander + grown * duration_s**2 / 3
-            covariance[axis, axis + 2] += 0.5 * grown * duration_s
-            covariance[axis + 2, axis] += 0.5 * grown * duration_s
-            covariance[axis + 2, axis + 2] += grown
-        covariance[range(4, STATES), range(4, STATES)] += (1.0 - kept * kept) * self._stationary
-        self.covariance = covariance
+        move_bank(
+            self.means,
+            self.covariance,
+            self._weights,
+            gained,
+            moved,
+            duration_s,
+            kept,
+            (1.0 - kept * kept) * self._stationary,
+            grown,
+            wander,
+        )
         self._log_likelihood = self._log_likelihood * math.exp(-duration_s / self._model.memory_s)
 
     def _manoeuvre(self, instant_s: float) -> float:
@@ -308,12 +280,8 @@ class LatencyEstimator:
 
     def _measure(self, name: str, part: slice, value: Pair, variance: float) -> Outcome:
         """Gated update of all filters with two components of the state; the gate is for their weighted mean."""
-        innovations = np.asarray(value) - self.means[:, part]
-        carried = self.covariance[:, part]
-        s = carried[part] + variance * np.eye(2)
-        inverse = np.array(((s[1, 1], -s[0, 1]), (-s[0, 1], s[0, 0]))) / (s[0, 0] * s[1, 1] - s[0, 1] ** 2)
-        expected = self._weights @ innovations
-        if not expected @ inverse @ expected <= GATE:
+        squares = np.empty(GRID_POINTS)
+        if not update_bank(self.means, self.covariance, self._weights, part.start, *value, variance, squares):
             self._rejected[name] += 1
             if self._rejected[name] < REJECTED_IN_A_ROW:
                 return Outcome.REJECTED
@@ -321,13 +289,6 @@ class LatencyEstimator:
             self._renew(part, value, variance)
             return Outcome.RESTARTED
         self._rejected[name] = 0
-        gain = carried @ inverse
-        self.means = self.means + innovations @ gain.T
-        kept = np.eye(STATES)
-        kept[:, part] -= gain
-        covariance = kept @ self.covariance @ kept.T + variance * gain @ gain.T
-        self.covariance = 0.5 * (covariance + covariance.T)
-        squares = np.sum(innovations @ inverse * innovations, axis=1)
         self._log_likelihood = self._log_likelihood - 0.5 * self._share * squares
         return Outcome.USED
 
@@ -352,8 +313,3 @@ class LatencyEstimator:
             raise ValueError(f"latency: expected finite values and positive variances, got {fix}")
         if self._stamp_s is not None and fix.stamp_s <= self._stamp_s:
             raise ValueError(f"latency: expected a fix after {self._stamp_s} s, got one of {fix.stamp_s} s")
-
-
-def _turned(vectors: Matrix) -> Matrix:
-    """North, east ``(..., 2)`` turned by 90 degrees: east component taken negative, then north."""
-    return np.stack((-vectors[..., 1], vectors[..., 0]), axis=-1)

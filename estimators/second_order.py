@@ -16,8 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.compiled import entry, kernel
 from estimators.layout import STATES_PER_AGENT
-from estimators.measurements import Kind, Matrix, RowTable, Vector
+from estimators.measurements import ROW, Kind, Matrix, RowTable, Vector
+
+_RANGE, _ANCHOR_RANGE = int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
 
 
 def linearisation_variance(rows: RowTable, states: Matrix, covariance: Matrix, eps: float) -> Vector:
@@ -27,35 +30,55 @@ def linearisation_variance(rows: RowTable, states: Matrix, covariance: Matrix, e
     in the rows' smoothed norm, m.
     """
     missed = np.zeros(len(rows))
-    ranges = np.flatnonzero((rows["kind"] == Kind.RANGE) | (rows["kind"] == Kind.ANCHOR_RANGE))
-    if not len(ranges):
-        return missed
-    chosen = rows[ranges]
-    agents = len(covariance) // STATES_PER_AGENT
-    blocks = covariance.reshape(agents, STATES_PER_AGENT, agents, STATES_PER_AGENT)
-    bodies = states[ranges].reshape(len(ranges), agents, STATES_PER_AGENT)
-    at, a, b, offset = np.arange(len(ranges)), chosen["agent"], chosen["other"], chosen["offset_s"][:, None]
-    paired = b >= 0
-    anchor = np.stack([chosen["x"], chosen["y"], chosen["z"]], axis=-1)
-    other = bodies[at, b]  # for anchors the last body, which is not used
-    there = np.where(paired[:, None], other[:, :3] + offset * other[:, 3:], anchor)
-    away = bodies[at, a, :3] + offset * bodies[at, a, 3:] - there
-    spread = blocks[a, :, a, :]
-    cross = blocks[a, :, b, :]
-    both = spread + blocks[b, :, b, :] - cross - cross.transpose(0, 2, 1)
-    spread = np.where(paired[:, None, None], both, spread)
-    o = offset[:, :, None]
-    spread = spread[:, :3, :3] + o * (spread[:, 3:, :3] + spread[:, :3, 3:]) + o * o * spread[:, 3:, 3:]
-    missed[ranges] = _second_moment(away, spread, eps)
+    _fill_second_moments(
+        np.ascontiguousarray(rows), np.ascontiguousarray(states), np.ascontiguousarray(covariance), eps, missed
+    )
     return missed
 
 
-def _second_moment(away: Matrix, spread: Matrix, eps: float) -> Vector:
-    """1/2 tr(TDTD) + 1/4 tr(TD)^2 for vectors ``(m, 3)`` and covariances ``(m, 3, 3)``."""
-    distance = np.sqrt(np.sum(away * away, axis=-1) + eps * eps)
-    unit = away / distance[:, None]
-    curvature = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / distance[:, None, None]
-    bent = curvature @ spread
-    squares = np.einsum("mij,mji->m", bent, bent)
-    trace = np.einsum("mii->m", bent)
-    return np.asarray(0.5 * squares + 0.25 * trace * trace, np.float64)
+@entry("void(ROW[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1])", ROW=ROW)
+def _fill_second_moments(rows: RowTable, states: Matrix, covariance: Matrix, eps: float, missed: Vector) -> None:
+    """1/2 tr(TDTD) + 1/4 tr(TD)^2 of the rows that are ranges."""
+    away = np.empty(3)
+    spread = np.empty((3, 3))
+    bent = np.empty((3, 3))
+    for m in range(rows.shape[0]):
+        row = rows[m]
+        if row["kind"] != _RANGE and row["kind"] != _ANCHOR_RANGE:
+            continue
+        a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
+        b = STATES_PER_AGENT * row["other"]  # negative for anchors
+        anchor = (row["x"], row["y"], row["z"])
+        for i in range(3):
+            there = states[m, b + i] + o * states[m, b + 3 + i] if b >= 0 else anchor[i]
+            away[i] = states[m, a + i] + o * states[m, a + 3 + i] - there
+            for j in range(3):
+                middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
+                ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
+                spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
+        distance = np.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + eps * eps)
+        for i in range(3):
+            for j in range(3):
+                bent[i, j] = 0.0
+                for k in range(3):
+                    identity = 1.0 if i == k else 0.0
+                    curvature = (identity - away[i] / distance * (away[k] / distance)) / distance
+                    bent[i, j] += curvature * spread[k, j]
+        squares, trace = 0.0, 0.0
+        for i in range(3):
+            trace += bent[i, i]
+            for j in range(3):
+                squares += bent[i, j] * bent[j, i]
+        missed[m] = 0.5 * squares + 0.25 * trace * trace
+
+
+@kernel
+def _relative(covariance: Matrix, a: int, b: int, i: int, j: int) -> float:
+    """Element of the covariance of the difference of two agents' states that begin at ``a`` and ``b``.
+
+    With ``b`` negative of the one at ``a`` alone.
+    """
+    value: float = covariance[a + i, a + j]
+    if b >= 0:
+        value = value + covariance[b + i, b + j] - covariance[a + i, b + j] - covariance[a + j, b + i]
+    return value

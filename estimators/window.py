@@ -6,6 +6,7 @@ from typing import Literal
 
 import numpy as np
 
+from estimators.compiled import entry, kernel
 from estimators.inputs import InputHistory
 from estimators.layout import Layout
 from estimators.measurements import (
@@ -18,11 +19,6 @@ from estimators.measurements import (
     empty_rows,
 )
 from estimators.row_kernels import IntArray, mark_usable
-
-_SORT_KEYS = ("z", "y", "x", "offset_s", "other", "agent", "kind", "observer", "tick")
-"""Least significant first, as `numpy.lexsort` takes them. Together they identify a record."""
-
-_IDENTITY = tuple(reversed(_SORT_KEYS))
 
 
 class MeasurementWindow:
@@ -83,20 +79,15 @@ class MeasurementWindow:
         self._insert_inputs(inputs)
         if not len(rows):
             return
-        rows = np.ascontiguousarray(rows, ROW)
-        usable = np.empty(len(rows), np.bool_)
-        mark_usable(rows, self.layout.size, usable)
-        timely = rows["tick"] >= self.first
-        self.refused += int(np.count_nonzero(~usable))
-        self.dropped += int(np.count_nonzero(usable & ~timely))
-        kept = rows[usable & timely]
-        if not len(kept):
-            return
-        np.maximum.at(self._last_heard, kept["observer"], kept["tick"])
-        merged = np.empty(len(self._rows) + len(kept), ROW)  # numpy's concatenation promotes every field, slowly
-        merged[: len(self._rows)], merged[len(self._rows) :] = self._rows, kept
-        merged = merged[np.lexsort([merged[key] for key in _SORT_KEYS])]
-        self._rows = merged[_first_of_each(merged)]
+        table = np.empty(len(self._rows) + len(rows), ROW)  # numpy's concatenation promotes every field, slowly
+        table[: len(self._rows)] = self._rows
+        new = np.ascontiguousarray(rows, ROW)
+        count, refused, dropped = _take_in(
+            table, len(self._rows), new, self.layout.size, self.first, self._last_heard
+        )
+        self._rows = table[:count]
+        self.refused += refused
+        self.dropped += dropped
 
     def insert_current(self, rows: RowTable, inputs: InputTable) -> None:
         """For a filter, which has no past to put late rows into: those of earlier ticks are dropped, counted."""
@@ -137,13 +128,59 @@ class MeasurementWindow:
         return np.asarray(self.last - np.maximum(self._last_heard, before))
 
 
-def _first_of_each(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Which of the sorted rows are the first of their identity."""
-    first = np.zeros(len(rows), np.bool_)
-    first[:1] = True
-    for key in _IDENTITY:
-        first[1:] |= rows[key][1:] != rows[key][:-1]
-    return first
+@entry("UniTuple(int64, 3)(ROW[::1], int64, ROW[::1], int64, int64, int64[::1])", ROW=ROW)
+def _take_in(
+    table: RowTable, count: int, rows: RowTable, agents: int, first: int, last_heard: IntArray
+) -> tuple[int, int, int]:
+    """Insert rows into the ``count`` sorted ones at the beginning of ``table``, of equal ones the earliest.
+
+    Gives the new count, how many rows no estimator could use, and how many were of ticks before ``first``.
+    ``last_heard`` gets the latest tick of each observer.
+    """
+    usable = np.empty(rows.shape[0], np.bool_)
+    mark_usable(rows, agents, usable)
+    refused, dropped = 0, 0
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        if not usable[r]:
+            refused += 1
+            continue
+        if row["tick"] < first:
+            dropped += 1
+            continue
+        last_heard[row["observer"]] = max(last_heard[row["observer"]], row["tick"])
+        at = count
+        while at > 0 and _is_before(row, table[at - 1]):
+            at -= 1
+        if at > 0 and not _is_before(table[at - 1], row):
+            continue  # the same record
+        for i in range(count, at, -1):
+            table[i] = table[i - 1]
+        table[at] = row
+        count += 1
+    return count, refused, dropped
+
+
+@kernel
+def _is_before(a: np.void, b: np.void) -> bool:
+    """The order of rows, by all that identifies a record: the most significant first."""
+    if a["tick"] != b["tick"]:
+        return bool(a["tick"] < b["tick"])
+    if a["observer"] != b["observer"]:
+        return bool(a["observer"] < b["observer"])
+    if a["kind"] != b["kind"]:
+        return bool(a["kind"] < b["kind"])
+    if a["agent"] != b["agent"]:
+        return bool(a["agent"] < b["agent"])
+    if a["other"] != b["other"]:
+        return bool(a["other"] < b["other"])
+    if a["offset_s"] != b["offset_s"]:
+        return bool(a["offset_s"] < b["offset_s"])
+    if a["x"] != b["x"]:
+        return bool(a["x"] < b["x"])
+    if a["y"] != b["y"]:
+        return bool(a["y"] < b["y"])
+    return bool(a["z"] < b["z"])
 
 
 def _seen_from_other_end(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:

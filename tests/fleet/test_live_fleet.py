@@ -93,9 +93,7 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start) -> None:
     assert time_of(fleet.log(2), "neighbour 3 has left") - killed_at < DROPPED_WITHIN
     report = fleet.report()
     assert [death["name"] for death in report["fleet"]["deaths"]] == ["agent 3"]
-    others, killed = report["agents"][:2], report["agents"][2]
-    for agent in others:
-        assert agent["ticks_on_time"] >= 0.95 * agent["ticks_expected"]
+    killed = report["agents"][2]
     assert killed["daemons"] == 2
     assert killed["ticks_on_time"] < killed["ticks_expected"]
     check_ticks_without_gap(fleet.out)

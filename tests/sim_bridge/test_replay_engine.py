@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import gc
 import math
+import tracemalloc
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -271,3 +273,34 @@ def test_samples_of_other_systems_in_a_log_are_not_taken() -> None:
 
     run = Run(logs=(Mixed(1, seconds=3.0), FlightLog(2, seconds=3.0), FlightLog(3, seconds=3.0)))
     assert run.counts.members[1]["gps: samples"] == 15
+
+
+class Forgetful(Run):
+    """Keeps nothing of what comes out."""
+
+    def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
+        pass
+
+    def on_reference(
+        self, agent_id: int, sample: TruthSample | AutopilotEstimate | GpsSample, arrival_s: float
+    ) -> None:
+        pass
+
+
+def test_memory_does_not_grow_with_the_logs() -> None:
+    def held_bytes(seconds: float) -> tuple[int, Forgetful]:
+        gc.collect()
+        before = tracemalloc.get_traced_memory()[0]
+        run = Forgetful(logs=tuple(FlightLog(i, seconds=seconds) for i in CENTRES))
+        gc.collect()
+        return tracemalloc.get_traced_memory()[0] - before, run
+
+    tracemalloc.start()
+    try:
+        held_bytes(8.0)  # what is loaded once
+        short, _short = held_bytes(8.0)
+        long, _long = held_bytes(20.0)
+    finally:
+        tracemalloc.stop()
+    # to keep no more than the records of 12 s takes 900 kB
+    assert long - short < 200_000

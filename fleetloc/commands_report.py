@@ -57,9 +57,8 @@ def _wait_for(files: list[Path], wait_s: float) -> None:
 
     began_s, deadline_s = time.time(), time.monotonic() + wait_s
     missing = files
-    while missing:
-        missing = [file for file in missing if not file.is_file() or file.stat().st_mtime < began_s]
-        if missing and time.monotonic() > deadline_s:
+    while missing := [file for file in missing if not file.is_file() or file.stat().st_mtime < began_s]:
+        if time.monotonic() > deadline_s:
             names = ", ".join(file.name for file in missing)
             raise RunFailed(f"{files[0].parent}: expected {names} within {wait_s:g} s, not written", REFUSED)
-        time.sleep(LOOK_PERIOD_S if missing else 0.0)
+        time.sleep(LOOK_PERIOD_S)

@@ -47,7 +47,7 @@ def _row(setting: Setting, name: str, figures: Figures) -> dict[str, float | Non
         "standard_errors_apart": None,
     }
     if name in setting.expected:
-        mse, error, _ = setting.expected[name]
+        mse, error = setting.expected[name]
         row["expected_mse_m2"] = mse
         row["standard_errors_apart"] = (figures.mse_m2 - mse) / float((figures.mse_se_m2**2 + error**2) ** 0.5)
     return row

@@ -209,6 +209,26 @@ async def test_two_daemons_find_their_autopilots_and_each_other(
     check_records(tmp_path / "rec")
 
 
+async def test_a_lost_autopilot_ends_the_daemon_only_where_that_is_asked_for(
+    config_of: Any, virtual_autopilot: type[Any], tmp_path: Path
+) -> None:
+    # GIVEN a daemon that is to end with its simulated flight, WHEN its autopilot falls silent
+    config = config_of(
+        1, "security.mode=unsigned", "mavlink.heartbeat_timeout_s=1.5", "mavlink.end_after_lost_s=0.2"
+    )
+    daemon = Daemon(config, 1, make_estimator, tmp_path)
+    autopilot = UdpAutopilot(virtual_autopilot(system_id=1, boot_s=time.monotonic() - 50), config.agent(1).mavlink)
+    running, flight = asyncio.create_task(daemon.run()), asyncio.create_task(autopilot.fly())
+    await until(lambda: daemon.core.counters["ticks"] > 5, "a flight")
+    assert not running.done()
+    flight.cancel()
+    # THEN it ends by itself, as if it had been told to, and its record is whole
+    await asyncio.wait_for(running, PATIENCE_S)
+    await asyncio.gather(flight, return_exceptions=True)
+    assert daemon.core.autopilot_state == "lost"
+    assert len(read_record(tmp_path / "rec" / "agent_001.estimates")[1]) == daemon.core.counters["ticks"]
+
+
 async def test_a_stranger_on_the_mavlink_port_gets_none_of_the_autopilots_frames(config_of: Any) -> None:
     # GIVEN a daemon, WHEN a vehicle of another system id sends it sound frames
     config = config_of(1, "security.mode=unsigned")

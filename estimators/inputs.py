@@ -47,18 +47,30 @@ class InputHistory:
         variance = np.full((ticks, 3 * n), self._other_variance)
         for slot, known in enumerate(self._known):
             columns = slice(3 * slot, 3 * slot + 3)
+            missing = []
             for k in range(ticks):
-                found = known.get(first + k) or (self._held(slot, first + k) if self._hold else None)
-                if found is not None:
+                found = known.get(first + k)
+                if found is None:
+                    missing.append(k)
+                else:
                     accel[k, columns], variance[k, columns] = found
+            change = self._mean_square_change(slot) if self._hold and missing else None
+            if change is None:
+                continue
+            for k in missing:
+                held = self._held(slot, first + k, change)
+                if held is not None:
+                    accel[k, columns], variance[k, columns] = held
         return accel, variance
 
-    def _held(self, slot: int, tick: int) -> tuple[Vector, Vector] | None:
-        """The last acceleration known before ``tick``, with the variance of holding it."""
+    def _held(self, slot: int, tick: int, change: float) -> tuple[Vector, Vector] | None:
+        """The last acceleration known before ``tick``, with the variance of holding it.
+
+        ``change``: mean square of what one tick changes.
+        """
         known = self._known[slot]
         before = [each for each in known if each < tick]
-        change = self._mean_square_change(slot)
-        if not before or change is None:
+        if not before:
             return None
         last = max(before)
         accel, variance = known[last]
@@ -66,7 +78,11 @@ class InputHistory:
         return accel * self._fade**held, np.minimum(variance + change * held**2, self._other_variance)
 
     def _mean_square_change(self, slot: int) -> float | None:
-        """Mean square per axis of what a tick changes beyond the fading, the sensor's noise included."""
+        """Mean square per axis of what a tick changes beyond the fading, the sensor's noise included.
+
+        Summed in the order of time: that of arrival would show in the last bits.
+        """
         known = self._known[slot]
-        changes = [known[tick + 1][0] - self._fade * accel for tick, (accel, _) in known.items() if tick + 1 in known]
+        pairs = [tick for tick in sorted(known) if tick + 1 in known]
+        changes = [known[tick + 1][0] - self._fade * known[tick][0] for tick in pairs]
         return float(np.mean(np.square(changes))) if len(changes) >= CHANGES_NEEDED else None

@@ -192,15 +192,11 @@ def _transplant_data(
 ) -> None:
     """What the data say of the kept agents stays; of a fresh one they say what its prior says."""
     at = states_of([new.layout.slot(agent) for agent in kept])
-    source = states_of([old.layout.slot(agent) for agent in kept])
     slots = [old.layout.slot(agent) for agent in kept]
     new.switches = old.switches
     new._data.information = information.copy()
-    new._covariance = symmetrised(np.linalg.inv(information))
     if kept:
         new._data.information[np.ix_(at, at)] = marginal_pair((old._data.information, old.prior_mean), slots)[0]
-        new._covariance[np.ix_(at, at)] = old._covariance[np.ix_(source, source)]
-    new._observable[:] = [agent in kept and old._observable[old.layout.slot(agent)] for agent in new.layout.agents]
 
 
 def _transplant_witness(

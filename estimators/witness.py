@@ -88,8 +88,8 @@ class Witness:
         self._places: dict[tuple[float, ...] | int, tuple[int, Vector]] = {}
         """Located bodies that ranges went to lately (slot, or an anchor's place): when, and where they were."""
         self._settled_ticks = 0
-        self._foretold: Body = prior
-        """The estimate of the last tick, moved to this one."""
+        self._foretold = Mixture.single(*prior)
+        """The estimate of the last tick, moved to this one, with its rows other than ranges."""
         self._lead_nats = 0.0
         """How much better than the estimate the hypotheses foretold what was measured, while they are apart."""
 
@@ -106,13 +106,12 @@ class Witness:
             return
         if self.mixture is None:
             self.mixture = Mixture.single(*estimate)
-        predict(self.mixture, accel, accel_variance, self._period_s)
-        moved = Mixture.single(*estimate)
-        predict(moved, accel, accel_variance, self._period_s)
-        self._foretold = moved.means[0], moved.covariances[0]
-        for row in rows[np.argsort(rows["value"], kind="stable")]:
-            if row["kind"] in (Kind.POSITION, Kind.VELOCITY):
-                correct_linear(self.mixture, _slope(row), float(row["value"]), float(row["variance"]))
+        self._foretold = Mixture.single(*estimate)
+        linear = rows[(rows["kind"] == Kind.POSITION) | (rows["kind"] == Kind.VELOCITY)]
+        for mixture in (self.mixture, self._foretold):  # both, or the ranges are weighed against an older guess
+            predict(mixture, accel, accel_variance, self._period_s)
+            for row in linear[np.argsort(linear["value"], kind="stable")]:
+                correct_linear(mixture, _slope(row), float(row["value"]), float(row["variance"]))
 
     def see(self, rows: RowTable, bodies: Mapping[int, Body]) -> None:
         """Use the ranges of a tick, nearest first, to the bodies that are located (by slot) and to anchors."""
@@ -141,10 +140,11 @@ class Witness:
     def _compare(self, ranges: Sequence[_Ranged]) -> None:
         """Weigh the ranges about to be used: how much better the hypotheses foretell them than the estimate."""
         assert self.mixture is not None
-        ours, theirs = self.mixture.copy(), Mixture.single(*self._foretold)
+        ours, theirs = self.mixture.copy(), self._foretold.copy()
+        known_nats = ours.evidence - theirs.evidence  # of the rows that both have used
         _use(ours, ranges)
         _use(theirs, ranges)
-        gained = self._lead_nats + ours.evidence - theirs.evidence
+        gained = self._lead_nats + ours.evidence - theirs.evidence - known_nats
         self._lead_nats = float(np.clip(gained, -2.0 * DECISIVE_NATS, 2.0 * DECISIVE_NATS))
 
     def judge(self, estimate: Body) -> Opinion | None:

@@ -24,7 +24,7 @@ from estimators.measurements import (
 )
 from estimators.settings import EstimatorSettings
 from sim_bridge.recording import Recording
-from sim_bridge.relay import Arrival, RecordRelay
+from sim_bridge.relay import Arrival, RecordRelay, adjacency
 
 Floats = NDArray[np.float64]
 
@@ -79,15 +79,10 @@ def neighbours(recording: Recording) -> list[list[int]]:
 
 
 class Links:
-    """Which packets of a recording reach whom, and when."""
+    """Which packets of a recording reach whom within the tick that they are sent in."""
 
     def __init__(self, recording: Recording) -> None:
-        self.neighbours = neighbours(recording)
-        adjacent = np.zeros((len(recording.agents),) * 2, bool)
-        for receiver, senders in enumerate(self.neighbours):
-            adjacent[receiver, senders] = True
-        reached = recording.received & adjacent
-        self._on_time = reached & (recording.delay_ticks == 0)
+        self._on_time = recording.received & adjacency(recording) & (recording.delay_ticks == 0)
 
     def heard(self, tick: int, receiver: int) -> list[int]:
         """Neighbours whose packets of this tick arrive within it: they take part in its consensus rounds."""

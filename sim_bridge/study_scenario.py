@@ -112,7 +112,7 @@ class Scenario:
             edges=np.array(edges, np.int64),
             accel=accel + rng.uniform(-ACCEL_HALF_WIDTH, ACCEL_HALF_WIDTH, accel.shape),
             gps=gps,
-            ranges=_ranges(rng, positions, edges),
+            ranges=noisy_ranges(rng, positions, edges),
             gps_half_width=np.array(GPS_HALF_WIDTH),
             range_half_width=RANGE_HALF_WIDTH,
             accel_half_width=ACCEL_HALF_WIDTH,
@@ -160,7 +160,7 @@ def _fly(
     return truth, accel
 
 
-def _ranges(rng: np.random.Generator, positions: NDArray[np.float64], edges: Edges) -> NDArray[np.float64]:
+def noisy_ranges(rng: np.random.Generator, positions: NDArray[np.float64], edges: Edges) -> NDArray[np.float64]:
     """Ranges ``(T+1, n, n)`` along the edges, both ends with their own noise."""
     ticks, n, _ = positions.shape
     ranges = np.full((ticks, n, n), np.nan)

@@ -33,6 +33,7 @@ from sim_bridge.study_scenario import (
     GOOD_P0,
     GPS_HALF_WIDTH,
     RANGE_HALF_WIDTH,
+    noisy_ranges,
 )
 
 PERIOD_S = 0.1
@@ -214,7 +215,7 @@ def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) ->
         edges=np.array(edges, np.int64),
         accel=accel + rng.uniform(-ACCEL_HALF_WIDTH, ACCEL_HALF_WIDTH, accel.shape),
         gps=gps + rng.uniform(-1.0, 1.0, gps.shape) * GPS_HALF_WIDTH,
-        ranges=_ranges(rng, truth[:, :, :3], edges),
+        ranges=noisy_ranges(rng, truth[:, :, :3], edges),
         gps_half_width=np.array(GPS_HALF_WIDTH),
         range_half_width=RANGE_HALF_WIDTH,
         accel_half_width=ACCEL_HALF_WIDTH,
@@ -224,15 +225,6 @@ def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) ->
         delay_ticks=np.zeros(everyone, np.int64),
         truth=truth,
     )
-
-
-def _ranges(rng: np.random.Generator, positions: Matrix, edges: Edges) -> Matrix:
-    ticks, n, _ = positions.shape
-    ranges = np.full((ticks, n, n), np.nan)
-    for a, b in [pair for edge in edges for pair in (edge, edge[::-1])]:
-        distance = np.linalg.norm(positions[:, a] - positions[:, b], axis=-1)
-        ranges[:, a, b] = distance + rng.uniform(-RANGE_HALF_WIDTH, RANGE_HALF_WIDTH, ticks)
-    return ranges
 
 
 class _ClosedLoop:

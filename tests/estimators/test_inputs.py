@@ -74,12 +74,17 @@ def test_an_input_is_held_forward_never_backward() -> None:
     assert accel[:, 3].tolist() == [0.0, 0.0, 1.0, 1.0]
 
 
-def test_the_order_of_arrival_does_not_matter() -> None:
-    rng = np.random.default_rng(1)
-    samples = {tick: float(rng.normal()) for tick in range(20) if tick % 7}
-    backwards = dict(reversed(samples.items()))
-    for one, other in zip(history(True, samples).table(10, 25), history(True, backwards).table(10, 25), strict=True):
-        assert (one == other).all()
+@pytest.mark.parametrize("seed", range(5))
+def test_the_order_of_arrival_does_not_matter(seed: int) -> None:
+    # GIVEN accelerations that change little enough to be held with less than the variance of an unknown one
+    rng = np.random.default_rng(seed)
+    samples = {tick: 0.1 * float(rng.normal()) for tick in range(20) if tick % 7}
+    shuffled = {int(tick): samples[int(tick)] for tick in rng.permutation(list(samples))}
+    one, other = history(True, samples).table(10, 25), history(True, shuffled).table(10, 25)
+    # THEN what is held is the same to the last bit
+    assert (one[0] == other[0]).all()
+    assert (one[1] == other[1]).all()
+    assert NOISE[0] < one[1][11, 3] < OTHER
 
 
 def test_the_first_of_two_inputs_for_one_tick_counts() -> None:

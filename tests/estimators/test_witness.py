@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimators.measurements import RowTable, empty_rows, position_rows, range_row
+from estimators.measurements import RowTable, empty_rows, position_rows, range_row, velocity_rows
 from estimators.witness import BLIND_TICKS, Body, Opinion, Witness, determined
 
 DT = 0.1
@@ -100,6 +100,22 @@ def test_one_or_two_neighbours_that_hover_do_not_tell(neighbours: int) -> None:
     places = {slot: TRIANGLE[slot] for slot in list(TRIANGLE)[:neighbours]}
     opinions, _ = watch(places, np.zeros(3), 30)
     assert all(opinion.ambiguous for opinion in opinions)
+
+
+@pytest.mark.parametrize("variance", [0.0001, 100.0])
+def test_a_measured_velocity_does_not_tilt_the_scales(variance: float) -> None:
+    # GIVEN a witness that holds the same as the estimate, as a mixture of one
+    rng = np.random.default_rng(2)
+    truth, sure = np.array([1.0, 2.0, -6.0, 0.0, 0.0, 0.0]), np.diag([0.01] * 6)
+    witness = Witness(0, (truth, sure), DT)
+    for tick in range(1, 200):
+        assert witness.mixture is not None
+        estimate = witness.mixture.means[0].copy(), witness.mixture.covariances[0].copy()
+        rows = velocity_rows(tick, 0, np.zeros(3), np.full(3, variance))
+        witness.advance(rows, np.zeros(3), QUIET, False, estimate)
+        witness.see(ranges(tick, truth, APEX, rng), bodies(APEX))
+    # THEN however many velocities it uses, neither foretells the ranges better
+    assert witness._lead_nats == pytest.approx(0.0, abs=1e-6)
 
 
 def test_it_sleeps_while_there_are_fixes_and_goes_on_from_the_estimate() -> None:

@@ -7,6 +7,7 @@ leaves at most one entry half written, which reading leaves out.
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,8 @@ FORMAT = "fleetloc-estimates/1"
 SUFFIX = ".estimates"
 FLUSH_EVERY = 10
 MAX_AGE_TICKS = 2**31 - 1
+CHUNK_NUMBERS = 1_000_000
+"""Size of the largest table that is held at a time where a record is read piece by piece, in numbers."""
 
 
 class RecordHeader(msgspec.Struct, frozen=True, kw_only=True):
@@ -123,6 +126,16 @@ def read_record(path: Path) -> tuple[RecordHeader, NDArray[np.void]]:
     dtype = entry_dtype(len(header.agents))
     whole = len(content) // dtype.itemsize
     return header, np.frombuffer(content, dtype, whole)
+
+
+def record_chunks(path: Path, agents: int) -> Iterator[NDArray[np.void]]:
+    """The entries of a record, so many at a time that their covariances stay within `CHUNK_NUMBERS`."""
+    dtype = entry_dtype(agents)
+    count = max(CHUNK_NUMBERS // Layout(tuple(range(agents))).dimension ** 2, 16)
+    with path.open("rb") as file:
+        file.readline()
+        while len(chunk := np.fromfile(file, dtype, count)):
+            yield chunk
 
 
 def covariance_of(entry: NDArray[np.void] | np.void, agents: int) -> Matrix:

@@ -63,7 +63,7 @@ def replay(
     Times are seconds from the start of the logs, negative from their end. Writes report.html, report.json and the
     estimates as CSV and MCAP. Flight records of our own daemons are repeated exactly and compared instead.
     """
-    from fleetloc.replay_report import write_report
+    from fleetloc.replay_exports import exporting
     from fleetloc.replay_run import clear, run_replay
     from fleetloc.replay_setup import Options, prepare, split_truth
     from fleetloc.warmup import announce, warm_up_everything
@@ -99,7 +99,12 @@ def replay(
     announce()
     warm_up_everything()
     replayed = run_replay(prepared, folder)
-    write_report(prepared, replayed, folder, json_file, began_s)
+    inputs = prepared.inputs
+    agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
+    with exporting(folder, prepared.config, agents, inputs.from_s, inputs.plan.epoch_unix_s):
+        from fleetloc.replay_report import write_report  # loading it takes as long as the export
+
+        write_report(prepared, replayed, folder, json_file, began_s)
     typer.echo(f"report: {folder / 'report.html'}")
 
 

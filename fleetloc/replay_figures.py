@@ -94,7 +94,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
             "engine_wall_s": replayed.wall_s,
             "engine_cpu_s": replayed.cpu_s,
             "silences_left_out": replayed.counts.leaps,
-            "ranges": dict(replayed.counts.ranges) | _range_lines(prepared),
+            "ranges": dict(replayed.counts.ranges) | _range_lines(prepared) | _synthetic(prepared),
             "truth_lines_skipped": {
                 file.path.name: dict(file.skipped) for file in prepared.truth_files.values() if file.skipped
             },
@@ -164,10 +164,16 @@ def _of_errors(errors: Errors) -> dict[str, Any]:
 
 
 def _range_lines(prepared: Prepared) -> dict[str, Any]:
-    counts = prepared.range_counts
+    counts = prepared.inputs.range_counts
     if not counts.read and not counts.skipped:
         return {}
     return {"lines_read": counts.read, "lines_skipped": dict(counts.skipped), "first_bad_lines": counts.lines}
+
+
+def _synthetic(prepared: Prepared) -> dict[str, Any]:
+    """What became of the ranges to be made of the truth."""
+    maker = prepared.inputs.synthesiser
+    return {} if maker is None else {"synthetic": dict(maker.made)}
 
 
 def _of_log(source: LogSource) -> dict[str, Any]:

@@ -16,9 +16,10 @@ from agent.mcap_record import SUFFIX as RECORD_SUFFIX
 from fleetloc.errors import InputError
 from sim_bridge.logs.events import LogSource, TruthSample
 from sim_bridge.logs.opening import open_log
-from sim_bridge.replay.engine import Inputs
+from sim_bridge.replay.feed import Inputs
 from sim_bridge.replay.plan import Plan, Vehicle, make_plan
 from sim_bridge.replay.range_files import UNIX_FROM_S, RangeCounts, RangeLine, read_ranges
+from sim_bridge.replay.reading import surveyed
 from sim_bridge.replay.recorded_ranges import ranges_of_record
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
 from sim_bridge.replay.truth_files import TruthFile
@@ -58,7 +59,7 @@ class Options:
 
 @dataclass(frozen=True, slots=True)
 class Prepared:
-    """A replay that can run; ``range_counts`` fill up while it does. Times are fleet time."""
+    """A replay that can run; the counts of its inputs fill up while it does. Times are fleet time."""
 
     config: FleetConfig
     inputs: Inputs
@@ -68,12 +69,11 @@ class Prepared:
     truth_from: str
     ranges_from: str
     truth_files: dict[int, TruthFile]
-    range_counts: RangeCounts
 
     @property
     def synthetic(self) -> bool:
         """Whether ranges are made of the truth."""
-        return isinstance(self.inputs.ranges, Synthesiser)
+        return self.inputs.synthesiser is not None
 
 
 def prepare(options: Options) -> Prepared:
@@ -95,16 +95,26 @@ def prepare(options: Options) -> Prepared:
     truth = {v.agent_id: _fleet_timed(v, files[_key(v)], plan) for v in plan.vehicles} if files else None
     counts = RangeCounts()
     ranges, ranges_from = _ranges(options, config, plan, from_s, counts)
+    truth_files = {v.agent_id: files[_key(v)] for v in plan.vehicles} if files else {}
     return Prepared(
         config=config,
-        inputs=Inputs(plan, drops, from_s, to_s, truth, ranges, at_stamps=options.arrival == STAMPED),
+        inputs=Inputs(
+            plan,
+            drops,
+            from_s,
+            to_s,
+            truth,
+            ranges,
+            at_stamps=options.arrival == STAMPED,
+            range_counts=counts,
+            truth_skipped={agent_id: file.skipped for agent_id, file in truth_files.items()},
+        ),
         sources=tuple(sources),
         seed=options.seed,
         origin_from=origin_from,
         truth_from=_truth_words(plan, files),
         ranges_from=ranges_from,
-        truth_files={v.agent_id: files[_key(v)] for v in plan.vehicles} if files else {},
-        range_counts=counts,
+        truth_files=truth_files,
     )
 
 
@@ -128,7 +138,7 @@ def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], st
         config = config_from(document, str(options.config), options.settings)
         origin_from = f"log {options.logs[0].name}"
     frame = FleetFrame.of(config)
-    sources = [open_log(path, frame=frame, sensors=config.sensors) for path in options.logs]
+    sources = surveyed([open_log(path, frame=frame, sensors=config.sensors) for path in options.logs])
     return config, sources, origin_from
 
 

@@ -70,6 +70,8 @@ class VirtualFleet:
         self._fleet_offset_s = fleet_offset_s
         self._unix_offset_s = unix_offset_s
         self._hearers = {i: config.neighbours(i) for i in config.ids}
+        self._timers: dict[int, float] = {}
+        """When each member is to be woken next, on the queue's clock."""
 
     @property
     def fleet_s(self) -> float:
@@ -82,12 +84,12 @@ class VirtualFleet:
         due_s = member.core.next_due_s()
         if due_s is not None:
             # a time that went through the offset may come out a hair early: the core then asks again
-            host_s = max(due_s - self._fleet_offset_s, math.nextafter(self._queue.now_s, math.inf))
-            self._queue.at(host_s, lambda: self._wake(member))
+            self._set_timer(member, max(due_s - self._fleet_offset_s, math.nextafter(self._queue.now_s, math.inf)))
 
     def join(self, member: Member) -> None:
         """An agent begins."""
         self._members[member.agent_id] = member
+        self._timers.pop(member.agent_id, None)
         self.advance(member)
 
     def leave(self, agent_id: int) -> None:
@@ -98,13 +100,24 @@ class VirtualFleet:
                 self._members[hearer].core.on_gone(agent_id)
                 self.advance(self._members[hearer])
 
-    def _wake(self, member: Member) -> None:
-        """A timer that an earlier packet has overtaken finds nothing to do."""
+    def _set_timer(self, member: Member, host_s: float) -> None:
+        """Wake a member then, unless it will be woken before."""
+        if host_s < self._timers.get(member.agent_id, math.inf):
+            self._timers[member.agent_id] = host_s
+            self._queue.at(host_s, lambda: self._wake(member, host_s))
+
+    def _wake(self, member: Member, host_s: float) -> None:
+        """A timer that an earlier one has replaced does nothing, one that a packet has overtaken is set anew."""
+        if self._members.get(member.agent_id) is not member or self._timers.get(member.agent_id) != host_s:
+            return
+        del self._timers[member.agent_id]
         due_s = member.core.next_due_s()
-        if self._members.get(member.agent_id) is not member or due_s is None:
+        if due_s is None:
             return
         if due_s - self._fleet_offset_s <= math.nextafter(self._queue.now_s, math.inf):
             self.advance(member)
+        else:
+            self._set_timer(member, due_s - self._fleet_offset_s)
 
     def _put_out(self, member: Member, outputs: list[Output]) -> None:
         for output in outputs:

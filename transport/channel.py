@@ -21,6 +21,8 @@ Probability = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Seconds = Annotated[float, msgspec.Meta(ge=0, le=3600)]
 
 _DRAWS = 8
+_DRAWN_AT_ONCE = 64
+"""Packets for which variates are drawn together; one by one they would be the same."""
 
 
 class Outage(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -106,13 +108,17 @@ class _Link:
         self._neighbour = neighbour
         self.faults = faults
         self._rng = rng
+        self._drawn: list[list[float]] = []
+        """Variates of the packets to come, the next one's last."""
         self._bad = False
         self._last_due = -math.inf
 
     def arrivals(self, now: float) -> tuple[float, ...]:
         """When a packet received at ``now`` is delivered: never, once, or twice."""
         f = self.faults
-        burst, loss, held, twice, *spread = self._rng.random(_DRAWS).tolist()
+        if not self._drawn:
+            self._drawn = self._rng.random((_DRAWN_AT_ONCE, _DRAWS)).tolist()[::-1]
+        burst, loss, held, twice, *spread = self._drawn.pop()
         self._bad = burst >= f.burst_end if self._bad else burst < f.burst_start
         lost = loss < (f.burst_loss if self._bad else f.loss)
         if lost or any(outage.covers(self._neighbour, now) for outage in f.outages):

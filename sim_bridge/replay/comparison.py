@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.recording import entry_dtype
+from agent.recording import record_chunks
 from agent.tracking import ABSENT_VARIANCE
 from estimators.estimator import Status
 from estimators.layout import STATES_PER_AGENT, Layout, block
@@ -23,7 +23,7 @@ LOCATED_SIGMA_M = 30.0
 PLACE_HOLDER = 0.5
 """Share of the variance of an absent drone above which a variance is that of a place holder."""
 CHUNK_NUMBERS = 1_000_000
-"""Size of the largest table that is held at a time, in numbers."""
+"""Size of the largest piece of a track that is held at a time, in numbers."""
 BLOCK = STATES_PER_AGENT
 
 SERIES = ("t_s", "status", *(f"{kind}_{axis}" for kind in ("own", "sigma", "truth", "autopilot") for axis in "ned"),
@@ -90,8 +90,8 @@ class References:
 
 def first_estimate_s(path: Path, layout: Layout, agent_id: int) -> float | None:
     """Fleet time of the first estimate of a record that locates its agent; ``None`` if there is none."""
-    for chunk in _chunks(path, layout.size):
-        known = _known(chunk, layout, agent_id, LOCATED_SIGMA_M**2)
+    for chunk in record_chunks(path, layout.size):
+        known = located(chunk, layout, agent_id, LOCATED_SIGMA_M**2)
         if known.any():
             return float(chunk["t_s"][known][0])
     return None
@@ -107,9 +107,9 @@ def compare(
 ) -> Compared:
     """Put the record of one agent's estimates (`agent.recording`) against the tracks of all agents."""
     result = Compared(agent_id, {phase.name: Errors() for phase in phases}, Thinned())
-    for chunk in _chunks(path, layout.size):
+    for chunk in record_chunks(path, layout.size):
         result.ticks += len(chunk)
-        known = _known(chunk, layout, agent_id)
+        known = located(chunk, layout, agent_id)
         result.without_estimate += int(np.count_nonzero(~known))
         for status in np.unique(chunk["status"]):
             name = Status(int(status)).name.lower()
@@ -121,12 +121,7 @@ def compare(
     return result
 
 
-def is_known(variance_m2: float) -> bool:
-    """Whether an agent is located at all, by the variance of a position: a place holder has a huge one."""
-    return bool(variance_m2 < PLACE_HOLDER * ABSENT_VARIANCE)
-
-
-def _known(
+def located(
     chunk: NDArray[np.void], layout: Layout, agent_id: int, below_m2: float = PLACE_HOLDER * ABSENT_VARIANCE
 ) -> NDArray[np.bool_]:
     """``(K,)``: whether an agent is located in the entries, the variance of its position north below a limit."""
@@ -152,7 +147,7 @@ def _compare_chunk(
     to_autopilot = chunk["mean"][:, own] - autopilot
     flown = np.concatenate([np.r_[block(layout.slot(agent))] for agent in references])
     for agent in references:
-        error[~_known(chunk, layout, agent), block(layout.slot(agent))] = np.nan
+        error[~located(chunk, layout, agent), block(layout.slot(agent))] = np.nan
     nees = _nees(error[:, flown], covariance[:, flown[:, None], flown])
     own_nees = _nees(error[:, own], covariance[:, own, own])
     full_norm = np.linalg.norm(error[:, flown], axis=1)
@@ -221,16 +216,6 @@ def _nees(error: Floats, covariance: Floats) -> Floats:
     squared = np.einsum("ij,ij->i", error[complete], solved)
     values[complete] = np.where(squared >= 0.0, squared, np.nan) / error.shape[1]
     return values
-
-
-def _chunks(path: Path, agents: int) -> Iterator[NDArray[np.void]]:
-    """The entries of a record, so many at a time that their covariances stay within `CHUNK_NUMBERS`."""
-    dtype = entry_dtype(agents)
-    count = max(CHUNK_NUMBERS // (BLOCK * agents) ** 2, 16)
-    with path.open("rb") as file:
-        file.readline()
-        while len(chunk := np.fromfile(file, dtype, count)):
-            yield chunk
 
 
 def _pieces(track: Track) -> Iterator[NDArray[np.void]]:

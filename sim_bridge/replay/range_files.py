@@ -76,6 +76,10 @@ class RangeCounts:
         if len(named) < LINES_NAMED:
             named.append(line)
 
+    def become(self, other: RangeCounts) -> None:
+        """Count what another has counted, in place of what was counted here."""
+        self.read, self.skipped, self.lines = other.read, other.skipped, other.lines
+
 
 def read_ranges(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:
     """The ranges of a file in the order of their times; memory does not grow with the file.

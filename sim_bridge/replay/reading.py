@@ -1,92 +1,81 @@
-"""The logs of a replay as one stream of samples in order of arrival, read here or by a second process.
+"""Logs read by processes beside the one that replays them.
 
 Finding frames, checking and converting them costs about as much as half of what the agents do with them, and nothing
-of it depends on the agents: a second process reads ahead, as far as its pipe holds (a few thousand samples, whatever
-the length of the logs). It says the same in the same order, so that results do not depend on who reads.
+of it depends on the agents. One process reads ahead of them, as far as its pipe holds (a few thousand samples,
+whatever the length of the logs); before that, the logs are surveyed side by side. What comes out is the same.
 """
 
 from __future__ import annotations
 
-import heapq
 import marshal
-import multiprocessing
-import os
 import pickle
-import signal
-import sys
-import threading
 import traceback
-import warnings
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
-from dataclasses import replace
 from itertools import islice
 from multiprocessing.connection import Connection
-from operator import itemgetter
 from typing import Any
 
-from agent.samples import AttitudeSample, AutopilotEstimate, ImuSample
-from sim_bridge.logs.events import LogCounts, LogSample, LogSource, TruthSample
+from agent.samples import AttitudeSample, ImuSample
+from sim_bridge import side_process
+from sim_bridge.logs.events import LogSource
 from sim_bridge.replay.errors import ReplayError
-from sim_bridge.replay.plan import Vehicle
+from sim_bridge.replay.feed import Arrival, Feed, Tallies
+from sim_bridge.replay.range_files import RangeLine
 
-LogArrival = tuple[float, int, LogSample]
-"""Fleet time of arrival, agent, sample on fleet time."""
 BATCH = 500
-"""Samples that cross the pipe together; a batch is about as large as the pipe's buffer."""
+"""Arrivals that cross the pipe together; a batch is about as large as the pipe's buffer."""
 END_S = 5.0
 """How long the reader may take to end once nobody listens to it."""
+STREAMED = ("tlog", "dataflash")
+"""Formats whose survey is a pass over the file that leaves nothing large behind."""
 
 _FREQUENT: tuple[tuple[type[Any], Callable[[Any], tuple[Any, ...]]], ...] = (
     (ImuSample, lambda s: (s.t_s, s.specific_force_mps2, s.gyro_radps)),
     (AttitudeSample, lambda s: (s.t_s, s.quaternion)),
-    (TruthSample, lambda s: (s.t_s, s.position_m, s.velocity_mps, s.quaternion, s.has_height)),
-    (AutopilotEstimate, lambda s: (s.t_s, s.position_m, s.velocity_mps)),
+    (RangeLine, lambda r: (r.time_s, r.observer, r.target, r.range_m, r.sigma_m, r.true_m)),
+    (type(None), lambda _: ()),
 )
-"""Kinds of samples that cross the pipe as their fields: `pickle` alone would cost more than reading the log."""
+"""What crosses the pipe as its fields: `pickle` alone would cost more than reading the log."""
 _PICKLED = len(_FREQUENT)
 _PLACE_OF = {kind: place for place, (kind, _) in enumerate(_FREQUENT)}
 
 
-def log_arrivals(vehicles: Sequence[Vehicle], *, to_s: float, with_truth: bool) -> Generator[LogArrival, None, None]:
-    """The samples of all vehicles in order of arrival, up to the first one after fleet time ``to_s``.
+def surveyed(sources: Sequence[LogSource]) -> list[LogSource]:
+    """The sources with their surveys made, side by side where that is possible.
 
-    Without ``with_truth`` those of the truth are left out. Raises `LogError`.
+    Raises `LogError` of the first log that cannot be read.
     """
-    by_source: dict[int, list[Vehicle]] = {}
-    for vehicle in vehicles:
-        by_source.setdefault(id(vehicle.source), []).append(vehicle)
-    streams = [_of_log(of_source[0].source, of_source, with_truth) for of_source in by_source.values()]
-    try:
-        for arrival in heapq.merge(*streams, key=itemgetter(0)):
-            yield arrival
-            if arrival[0] > to_s:
-                return
-    finally:
-        for stream in streams:
-            stream.close()
+    alike = all(source.format in STREAMED for source in sources)
+    if len(sources) > 1 and alike and side_process.may_fork():
+        try:
+            with side_process.workers(len(sources)) as pool:
+                return list(pool.map(_surveyed, sources))
+        except BrokenProcessPool:
+            names = ", ".join(source.path.name for source in sources)
+            raise ReplayError(names, "to be surveyed", "the surveying process was killed") from None
+    return [_surveyed(source) for source in sources]
 
 
 @contextmanager
-def read_beside(vehicles: Sequence[Vehicle], *, to_s: float, with_truth: bool) -> Iterator[Iterator[LogArrival]]:
-    """`log_arrivals`, read by a second process where that is possible.
+def read_beside(feed: Feed) -> Iterator[Iterator[Arrival]]:
+    """The arrivals of a feed, made by a second process where that is possible.
 
-    The sources' ``counts`` are complete once the stream has ended. The reader ends with the context at the latest.
+    The feed's tallies are complete once the stream has ended. The reader ends with the context at the latest.
     """
-    if not _may_fork():
-        yield log_arrivals(vehicles, to_s=to_s, with_truth=with_truth)
+    if not side_process.may_fork():
+        yield feed.arrivals()
         return
-    context = multiprocessing.get_context("fork")
+    context = side_process.CONTEXT
     receiving, sending = context.Pipe(duplex=False)
-    arguments = (receiving, sending, vehicles, to_s, with_truth)
-    reader = context.Process(target=_read, args=arguments, name="log reader", daemon=True)
-    with warnings.catch_warnings():
-        # of native threads, which Python >= 3.12 warns of: those of BLAS are made for it, and the reader uses none
-        warnings.simplefilter("ignore", DeprecationWarning)
+    reader = context.Process(target=_read, args=(receiving, sending, feed), name="log reader", daemon=True)
+    with side_process.forking():
         reader.start()
     sending.close()
+    feed.references.close()  # the reader has its own
     try:
-        yield _received(receiving, vehicles)
+        yield _received(receiving, feed)
     finally:
         receiving.close()
         reader.join(END_S)
@@ -96,46 +85,25 @@ def read_beside(vehicles: Sequence[Vehicle], *, to_s: float, with_truth: bool) -
         reader.close()
 
 
-def _may_fork() -> bool:
-    """Whether a copy of this process can read: a second processor, and no thread that could hold a lock."""
-    return sys.platform == "linux" and (os.cpu_count() or 1) > 1 and threading.active_count() == 1
-
-
-def _of_log(source: LogSource, vehicles: list[Vehicle], with_truth: bool) -> Generator[LogArrival, None, None]:
-    of_system = {vehicle.survey.system_id: vehicle for vehicle in vehicles}
-    for event in source.events():
-        vehicle = of_system.get(event.system_id)
-        if vehicle is None or (not with_truth and isinstance(event.sample, TruthSample)):
-            continue
-        shift_s = vehicle.shift_s
-        yield event.arrival_s + shift_s, vehicle.agent_id, _shifted(event.sample, shift_s)
-
-
-def _shifted(sample: LogSample, shift_s: float) -> LogSample:
-    """A sample on fleet time; the frequent kinds are made directly, as `replace` is slow."""
-    if isinstance(sample, ImuSample):
-        return ImuSample(sample.t_s + shift_s, sample.specific_force_mps2, sample.gyro_radps)
-    if isinstance(sample, AttitudeSample):
-        return AttitudeSample(sample.t_s + shift_s, sample.quaternion)
-    return replace(sample, t_s=sample.t_s + shift_s)
+def _surveyed(source: LogSource) -> LogSource:
+    source.survey()
+    return source
 
 
 # --- over the pipe -------------------------------------------------------------------------------------------
 
 
-def _read(
-    receiving: Connection, sending: Connection, vehicles: Sequence[Vehicle], to_s: float, with_truth: bool
-) -> None:
-    """The second process: batches, an empty message, then the sources' counts or what was raised."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)  # it ends when the replay closes the pipe
+def _read(receiving: Connection, sending: Connection, feed: Feed) -> None:
+    """The second process: batches, an empty message, then what was counted or what was raised."""
+    side_process.ignore_interrupts()  # it ends when the replay closes the pipe
     receiving.close()  # else it would keep its own pipe open
-    arrivals = log_arrivals(vehicles, to_s=to_s, with_truth=with_truth)
-    end: list[LogCounts] | Exception
+    arrivals = feed.arrivals()
+    end: Tallies | Exception
     try:
         try:
             while batch := [_packed(arrival) for arrival in islice(arrivals, BATCH)]:
                 sending.send_bytes(marshal.dumps(batch))
-            end = [vehicle.source.counts for vehicle in vehicles]
+            end = feed.tallies()
         except BrokenPipeError:
             raise
         except Exception as fault:  # noqa: BLE001 - whatever it is, the replay is to raise it
@@ -147,25 +115,24 @@ def _read(
         return  # the replay has ended before the logs
 
 
-def _received(receiving: Connection, vehicles: Sequence[Vehicle]) -> Iterator[LogArrival]:
+def _received(receiving: Connection, feed: Feed) -> Iterator[Arrival]:
     makers = [kind for kind, _ in _FREQUENT]
     try:
         while data := receiving.recv_bytes():
             for arrival_s, agent_id, place, fields in marshal.loads(data):
-                sample = pickle.loads(fields) if place == _PICKLED else makers[place](*fields)
-                yield arrival_s, agent_id, sample
+                heard = pickle.loads(fields) if place == _PICKLED else makers[place](*fields)
+                yield arrival_s, agent_id, heard
         end = pickle.loads(receiving.recv_bytes())
     except EOFError:
-        names = ", ".join(dict.fromkeys(vehicle.source.path.name for vehicle in vehicles))
+        names = ", ".join(dict.fromkeys(vehicle.source.path.name for vehicle in feed.inputs.plan.vehicles))
         raise ReplayError(names, "to be read to the end", "the reading process was killed") from None
     if isinstance(end, Exception):
         raise end
-    for vehicle, counts in zip(vehicles, end, strict=True):
-        vehicle.source.counts = counts
+    feed.absorb(end)
 
 
-def _packed(arrival: LogArrival) -> tuple[float, int, int, Any]:
-    arrival_s, agent_id, sample = arrival
-    place = _PLACE_OF.get(type(sample), _PICKLED)
-    fields = pickle.dumps(sample) if place == _PICKLED else _FREQUENT[place][1](sample)
+def _packed(arrival: Arrival) -> tuple[float, int, int, Any]:
+    arrival_s, agent_id, heard = arrival
+    place = _PLACE_OF.get(type(heard), _PICKLED)
+    fields = pickle.dumps(heard) if place == _PICKLED else _FREQUENT[place][1](heard)
     return arrival_s, agent_id, place, fields

@@ -49,9 +49,10 @@ class TrackWriter:
             self._flush()
 
     def close(self) -> None:
-        """Write out what is held."""
-        self._flush()
-        self._file.close()
+        """Write out what is held; may be called again."""
+        if not self._file.closed:
+            self._flush()
+            self._file.close()
 
     def _flush(self) -> None:
         self._file.write(self._buffer[: self._held].tobytes())

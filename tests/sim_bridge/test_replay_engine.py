@@ -29,7 +29,8 @@ from sim_bridge.logs.events import (
     TruthSample,
     UnixZero,
 )
-from sim_bridge.replay.engine import Inputs, Replay, ReplayCounts
+from sim_bridge.replay.engine import Replay, ReplayCounts
+from sim_bridge.replay.feed import Feed, Inputs
 from sim_bridge.replay.plan import make_plan
 from sim_bridge.replay.range_files import RangeLine
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
@@ -142,7 +143,8 @@ class Run:
             source = Synthesiser({i: config.neighbours(i) for i in config.ids}, SyntheticNoise(), 1)
         inputs = Inputs(plan, windows, plan.start_s, min(plan.end_s, plan.start_s + to_s), None, source, at_stamps)
         self.layout = Layout(config.ids)
-        self.replay = Replay(config, inputs, make_estimator, self)
+        self.closed = 0
+        self.replay = Replay(config, Feed(inputs, self), make_estimator, self.on_estimate)
         self.counts: ReplayCounts = self.replay.run()
 
     def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
@@ -152,6 +154,9 @@ class Run:
         self, agent_id: int, sample: TruthSample | AutopilotEstimate | GpsSample, arrival_s: float
     ) -> None:
         self.references.setdefault(agent_id, []).append(sample)
+
+    def close(self) -> None:
+        self.closed += 1
 
     def errors_m(self, agent_id: int, from_s: float = SETTLED_S) -> np.ndarray:
         """Distances of the own estimates from the truth, from a time after the start."""
@@ -186,6 +191,7 @@ def test_every_drone_knows_its_place_better_than_its_receiver_does(whole: Run) -
 def test_references_come_out_for_the_comparison(whole: Run) -> None:
     kinds = {kind: sum(isinstance(s, kind) for s in whole.references[2]) for kind in (TruthSample, GpsSample)}
     assert kinds == {TruthSample: int(SECONDS * 20), GpsSample: int(SECONDS * 5)}
+    assert whole.closed == 1
 
 
 def test_twice_is_equal_bit_by_bit(whole: Run) -> None:

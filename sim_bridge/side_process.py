@@ -1,0 +1,42 @@
+"""Processes beside this one for work that does not depend on it: copies of this process that end with their work."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import sys
+import threading
+import warnings
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
+from multiprocessing.context import ForkContext
+
+CONTEXT: ForkContext = multiprocessing.get_context("fork")
+
+
+def may_fork() -> bool:
+    """Whether a copy of this process can work: a second processor, and no thread that could hold a lock."""
+    return sys.platform == "linux" and (os.cpu_count() or 1) > 1 and threading.active_count() == 1
+
+
+@contextmanager
+def forking() -> Iterator[None]:
+    """Without the warning of native threads (Python >= 3.12): those of BLAS are made for it, no copy uses them."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", DeprecationWarning)
+        yield
+
+
+def ignore_interrupts() -> None:
+    """In a copy: the process that waits for it ends it."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
+@contextmanager
+def workers(tasks: int) -> Iterator[ProcessPoolExecutor]:
+    """As many copies as there are tasks or processors; where one is killed, `BrokenProcessPool` is raised."""
+    count = min(tasks, os.cpu_count() or 1)
+    with forking(), ProcessPoolExecutor(count, CONTEXT, initializer=ignore_interrupts) as pool:
+        yield pool

@@ -69,6 +69,7 @@ def replay(
     from fleetloc.warmup import announce, warm_up_everything
 
     began_s = time.monotonic()
+    truth_given = truth
     logs, truth = split_truth(logs, truth or ())
     options: dict[str, object] = {
         "estimator.kind": estimator,
@@ -79,7 +80,11 @@ def replay(
     settings = [f"{key}={value}" for key, value in options.items() if value is not None] + list(overrides or ())
     folder = out or Path("out") / "replay"
     if any(path.suffix == ".mcap" for path in logs):
-        _repeat(config, logs, settings, folder, json_file)
+        given = {"--ranges": ranges_from, "--truth": truth_given, "--drop-gps": drop_gps, "--loss": loss,
+                 "--delay": delay_s, "--from": from_s, "--to": to_s, "--seed": seed,
+                 "--arrival": None if arrival == "logged" else arrival}  # fmt: skip
+        refused = [name for name, value in given.items() if value is not None]
+        _repeat(config, logs, refused, settings, folder, json_file)
         return
     prepared = prepare(
         Options(
@@ -101,19 +106,24 @@ def replay(
     replayed = run_replay(prepared, folder)
     inputs = prepared.inputs
     agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
-    with exporting(folder, prepared.config, agents, inputs.from_s, inputs.plan.epoch_unix_s):
+    with exporting(folder, prepared.config, agents, inputs.plan.start_s, inputs.plan.epoch_unix_s):
         from fleetloc.replay_report import write_report  # loading it takes as long as the export
 
         write_report(prepared, replayed, folder, json_file, began_s)
     typer.echo(f"report: {folder / 'report.html'}")
 
 
-def _repeat(config: Path, logs: list[Path], settings: list[str], folder: Path, json_file: Path | None) -> None:
-    from fleetloc.errors import FAILED
+def _repeat(
+    config: Path, logs: list[Path], refused: list[str], settings: list[str], folder: Path, json_file: Path | None
+) -> None:
+    from fleetloc.errors import FAILED, InputError
     from fleetloc.replay_records import RECORDED, refuse_mixture, replay_records
     from fleetloc.warmup import announce, warm_up_everything
 
     refuse_mixture(logs)
+    if refused:
+        expected = "no such option: a flight record is repeated with what was received (replay its .tlog instead)"
+        raise InputError(", ".join(refused), "", expected, "logs that are flight records (.mcap)")
     announce()
     warm_up_everything()
     equal = replay_records(config, logs, settings, folder, json_file)

@@ -16,6 +16,7 @@ from fleetloc.replay_run import Replayed, track_path
 from fleetloc.replay_setup import Prepared
 from sim_bridge.logs.events import LogSource
 from sim_bridge.replay.comparison import Compared, Errors, Phase, References, compare, first_estimate_s
+from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.tracks import Track
 
 SETTLED_S = 10.0
@@ -62,21 +63,28 @@ def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
     phases = [Phase(ALL, begin_s, inputs.to_s), Phase(SETTLED, begin_s + SETTLED_S, inputs.to_s)]
     for agent_id, windows in inputs.drops.windows.items():
         for from_s, to_s in windows:
-            name = f"gps of {agent_id} dropped {from_s - inputs.from_s:.0f}..{to_s - inputs.from_s:.0f} s"
+            zero_s = inputs.plan.start_s
+            name = f"gps of {agent_id} dropped {from_s - zero_s:.0f}..{to_s - zero_s:.0f} s"
             phases.append(Phase(name, max(from_s, begin_s), to_s))
     return phases
 
 
 def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> dict[str, Any]:
     """The content of ``report.json`` but for how long it all took; units are in the names, what is not known is null.
+
+    Times are seconds from the start of the logs.
     """
-    inputs = prepared.inputs
-    duration_s = max(replayed.counts.last_s - inputs.from_s, prepared.config.fleet.period_s)
+    inputs, counts = prepared.inputs, replayed.counts
+    zero_s = inputs.plan.start_s
+    duration_s = max(counts.last_s - inputs.from_s - counts.left_out_s, prepared.config.fleet.period_s)
+    names = names_apart(source.path for source in prepared.sources)
     agents = [_of_agent(prepared, replayed, results, agent_id) for agent_id in results.compared]
     return {
         "config": msgspec.to_builtins(prepared.config),
         "mode": "replay",
         "seed": prepared.seed,
+        "from_s": inputs.from_s - zero_s,
+        "to_s": max(counts.last_s, inputs.from_s) - zero_s,
         "duration_s": duration_s,
         "truth": prepared.truth_from,
         "ranges": prepared.ranges_from,
@@ -85,7 +93,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
         "clocks": inputs.plan.clocks,
         "arrival": "stamped" if inputs.at_stamps else "logged",
         "gps_dropped": [
-            {"agent": agent_id, "from_s": from_s - inputs.from_s, "to_s": to_s - inputs.from_s}
+            {"agent": agent_id, "from_s": from_s - zero_s, "to_s": to_s - zero_s}
             for agent_id, windows in inputs.drops.windows.items()
             for from_s, to_s in windows
         ],
@@ -93,19 +101,23 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
         "fleet": {
             "engine_wall_s": replayed.wall_s,
             "engine_cpu_s": replayed.cpu_s,
-            "silences_left_out": replayed.counts.leaps,
-            "ranges": dict(replayed.counts.ranges) | _range_lines(prepared) | _synthetic(prepared),
+            "silences_left_out": counts.leaps,
+            "left_out_s": counts.left_out_s,
+            "ranges": dict(counts.ranges) | _range_lines(prepared) | _synthetic(prepared),
             "truth_lines_skipped": {
-                file.path.name: dict(file.skipped) for file in prepared.truth_files.values() if file.skipped
+                str(agent_id): dict(file.skipped)
+                for agent_id, file in prepared.truth_files.items()
+                if file.skipped
             },
         },
-        "logs": [_of_log(source) for source in prepared.sources],
+        "logs": [_of_log(source, names[source.path]) for source in prepared.sources],
     }
 
 
 def _of_agent(prepared: Prepared, replayed: Replayed, results: Results, agent_id: int) -> dict[str, Any]:
     compared, counters = results.compared[agent_id], Counter(replayed.counts.members[agent_id])
-    vehicle = next(v for v in prepared.inputs.plan.vehicles if v.agent_id == agent_id)
+    plan = prepared.inputs.plan
+    vehicle = next(v for v in plan.vehicles if v.agent_id == agent_id)
     whole, settled = (_of_errors(compared.errors[name]) for name in (ALL, SETTLED))
     latency, first_s = replayed.latency.get(agent_id), results.first_s[agent_id]
     sensors = counted_sensors(counters)
@@ -113,14 +125,14 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: Results, agent_id
         _, sensors["gps"]["latency_s"], sensors["gps"]["latency_sigma_s"] = latency.table(3)[-1].tolist()
     return {
         "id": agent_id,
-        "log": vehicle.source.path.name,
+        "log": names_apart(source.path for source in prepared.sources)[vehicle.source.path],
         "system_id": vehicle.survey.system_id,
         "autopilot": vehicle.survey.flavour,
         "autopilot_estimate_frame": vehicle.survey.estimate_frame,
         "ticks_expected": compared.ticks,
         "ticks_on_time": counters["ticks"] - counters["ticks: late"],
         "ticks_without_estimate": compared.without_estimate,
-        "first_estimate_s": None if first_s is None else first_s - prepared.inputs.from_s,
+        "first_estimate_s": None if first_s is None else first_s - plan.start_s,
         "statuses": compared.statuses,
         **whole,
         "position_rmse_after_10s_m": settled["position_rmse_m"],
@@ -131,7 +143,7 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: Results, agent_id
         "cpu_fraction": None,
         "rss_mb": None,
         "phases": {
-            phase.name: {"from_s": phase.from_s - prepared.inputs.from_s, "to_s": phase.to_s - prepared.inputs.from_s}
+            phase.name: {"from_s": phase.from_s - plan.start_s, "to_s": phase.to_s - plan.start_s}
             | _of_errors(compared.errors[phase.name])
             for phase in results.phases[agent_id]
         },
@@ -176,11 +188,11 @@ def _synthetic(prepared: Prepared) -> dict[str, Any]:
     return {} if maker is None else {"synthetic": dict(maker.made)}
 
 
-def _of_log(source: LogSource) -> dict[str, Any]:
+def _of_log(source: LogSource, name: str) -> dict[str, Any]:
     """What became of a log's content."""
     survey, counts = source.survey(), source.counts
     return {
-        "file": source.path.name,
+        "file": name,
         "format": source.format,
         "duration_s": survey.last_s - survey.first_s,
         "unix_time_known_by": survey.unix.known_by,

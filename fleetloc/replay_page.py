@@ -44,10 +44,10 @@ def drawn_sections(
     config, inputs = prepared.config, prepared.inputs
     colours = {agent_id: colour(slot) for slot, agent_id in enumerate(config.ids) if agent_id in results.compared}
     series = [
-        replay_plots.Series(agent_id, compared.series, len(config.ids), inputs.from_s, config.fleet.period_s)
+        replay_plots.Series(agent_id, compared.series, len(config.ids), inputs.plan.start_s, config.fleet.period_s)
         for agent_id, compared in results.compared.items()
     ]  # fmt: skip
-    duration_s = figures["duration_s"]
+    span_s = figures["from_s"], figures["to_s"]
     dropped: dict[int, list[tuple[float, float]]] = {}
     for drop in figures["gps_dropped"]:
         dropped.setdefault(drop["agent"], []).append((drop["from_s"], drop["to_s"]))
@@ -59,31 +59,31 @@ def drawn_sections(
          _table(*error_table(figures))),
         ("Logs", "Samples that were used, and content that was not, by reason.", _table(*log_table(figures))),
         ("Where they were", "Colour: the fleet's estimate; black, dashed: the autopilot's own; grey: truth.",
-         replay_plots.trajectories(series, duration_s, colours)),
+         replay_plots.trajectories(series, span_s, colours)),
     ]  # fmt: skip
     if has_truth:
         sections += [
             ("Error against the truth, with the 3-sigma band",
              "Colour: the fleet's estimate of the drone itself, and what it claims. Black, dashed: the autopilot's "
              "own estimate. Grey: GPS of this drone was dropped.",
-             replay_plots.errors(series, duration_s, colours, dropped, "truth")),
+             replay_plots.errors(series, span_s, colours, dropped, "truth")),
             ("Consistency", "Near 1 is right, above it the estimator is overconfident, below it is cautious.",
-             replay_plots.consistency(series, duration_s, colours, dropped)),
+             replay_plots.consistency(series, span_s, colours, dropped)),
         ]  # fmt: skip
     elif any(len(references.autopilot) for references in results.references.values()):
         sections.append(
             ("Difference to the autopilot's own estimate", _AUTOPILOT_NOTE,
-             replay_plots.errors(series, duration_s, colours, dropped, "autopilot"))
+             replay_plots.errors(series, span_s, colours, dropped, "autopilot"))
         )  # fmt: skip
     if latencies:
         sections.append(
             ("Latency of GPS", "How much older a position is than its stamp: as known beforehand, then learned from "
              "manoeuvres; the band is 1-sigma.",
-             replay_plots.latency(latencies, inputs.from_s, duration_s, colours))
+             replay_plots.latency(latencies, inputs.plan.start_s, span_s, colours))
         )  # fmt: skip
     sections += [
         ("Age of the news", "By drone: how old the newest measurement of each drone (its colour) is in its estimate.",
-         replay_plots.ages(series, config.ids, duration_s, colours)),
+         replay_plots.ages(series, config.ids, span_s, colours)),
         ("Packets", "On the virtual radio between the drones.", packets(figures["agents"])),
     ]  # fmt: skip
     return sections

@@ -13,6 +13,8 @@ from fleetloc.report_plots import AXES, figure_of, plain_log, span_of, styled
 from sim_bridge.replay.comparison import SERIES
 from sim_bridge.replay.statistics import Thinned
 
+Span = tuple[float, float]
+"""Of the part that was replayed, s from the start of the logs."""
 Windows = Sequence[tuple[float, float]]
 OTHERS = ("#999999", "#000000")
 """Truth, and the autopilot's own estimate."""
@@ -22,7 +24,7 @@ WINDOWS_PERCENT = 98
 
 
 class Series:
-    """One agent's thinned series with time from the start of the replay; columns by name."""
+    """One agent's thinned series with time from the start of the logs; columns by name."""
 
     def __init__(self, agent_id: int, thinned: Thinned, agents: int, start_s: float, period_s: float) -> None:
         self.agent_id = agent_id
@@ -56,7 +58,7 @@ class Series:
 
 
 @styled
-def trajectories(series: Sequence[Series], duration_s: float, colour: Mapping[int, str]) -> Figure:
+def trajectories(series: Sequence[Series], span_s: Span, colour: Mapping[int, str]) -> Figure:
     """Top view and height: truth grey, the autopilot's own dashed, the fleet's estimate in colour."""
     figure = figure_of(4.8)
     above, beside = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.25)})
@@ -77,7 +79,7 @@ def trajectories(series: Sequence[Series], duration_s: float, colour: Mapping[in
         beside.set_ylim(*span_of(-places[:, 2]))
     above.set(title="seen from above", xlabel="east m", ylabel="north m")
     above.set_aspect("equal", adjustable="box")
-    beside.set(title="height above the origin", xlabel="time s", ylabel="m", xlim=(0, duration_s))
+    beside.set(title="height above the origin", xlabel="time s", ylabel="m", xlim=span_s)
     figure.legend(loc="outside lower center", ncols=8)
     return figure
 
@@ -85,7 +87,7 @@ def trajectories(series: Sequence[Series], duration_s: float, colour: Mapping[in
 @styled
 def errors(
     series: Sequence[Series],
-    duration_s: float,
+    span_s: Span,
     colour: Mapping[int, str],
     dropped: Mapping[int, Windows],
     against: str,
@@ -104,7 +106,7 @@ def errors(
             if other is not None:
                 axes.plot(*one.lines(other[:, axis]), color=OTHERS[1], linewidth=0.6, linestyle="--")
             axes.plot(when, middle, color=colour[one.agent_id], linewidth=0.9)
-            axes.set(xlim=(0, duration_s), ylim=_limits(error[:, axis], sigma[:, axis]))
+            axes.set(xlim=span_s, ylim=_limits(error[:, axis], sigma[:, axis]))
             _shade(axes, dropped.get(one.agent_id, ()))
         row[0].set_ylabel(f"{one.label}\nm")
     for axes, name in zip(grid[0], AXES, strict=True):
@@ -116,7 +118,7 @@ def errors(
 
 @styled
 def consistency(
-    series: Sequence[Series], duration_s: float, colour: Mapping[int, str], dropped: Mapping[int, Windows]
+    series: Sequence[Series], span_s: Span, colour: Mapping[int, str], dropped: Mapping[int, Windows]
 ) -> Figure:
     """NEES over its dimension, of the own state and of the whole fleet's."""
     figure = figure_of(3.0)
@@ -126,7 +128,7 @@ def consistency(
         for one in series:
             axes.plot(*one.lines(one.column(name)), color=colour[one.agent_id], linewidth=0.7, label=one.label)
             _shade(axes, dropped.get(one.agent_id, ()))
-        axes.set(yscale="log", xlim=(0, duration_s), xlabel="time s", title=title)
+        axes.set(yscale="log", xlim=span_s, xlabel="time s", title=title)
         plain_log(axes)
     whole.set_ylabel("NEES / dimension")
     figure.legend(*own.get_legend_handles_labels(), loc="outside lower center", ncols=8)
@@ -134,7 +136,7 @@ def consistency(
 
 
 @styled
-def ages(series: Sequence[Series], agents: Sequence[int], duration_s: float, colour: Mapping[int, str]) -> Figure:
+def ages(series: Sequence[Series], agents: Sequence[int], span_s: Span, colour: Mapping[int, str]) -> Figure:
     """How old the news is that each agent has of each other."""
     figure = figure_of(0.8 + 1.3 * len(series))
     grid = figure.subplots(len(series), 1, sharex=True, squeeze=False)[:, 0]
@@ -145,14 +147,14 @@ def ages(series: Sequence[Series], agents: Sequence[int], duration_s: float, col
                 age_s = one.age_s(slot)
                 highest_s = max(highest_s, float(np.percentile(age_s, WINDOWS_PERCENT)))
                 axes.plot(*one.lines(age_s), color=colour[agent_id], linewidth=0.8)
-        axes.set(xlim=(0, duration_s), ylim=(0, max(1.3 * highest_s, 0.5)), ylabel=f"{one.label}\ns")
+        axes.set(xlim=span_s, ylim=(0, max(1.3 * highest_s, 0.5)), ylabel=f"{one.label}\ns")
     grid[-1].set_xlabel("time s")
     return figure
 
 
 @styled
 def latency(
-    tables: Mapping[int, Floats], start_s: float, duration_s: float, colour: Mapping[int, str]
+    tables: Mapping[int, Floats], start_s: float, span_s: Span, colour: Mapping[int, str]
 ) -> Figure:
     """Latency of each drone's GPS as it was estimated, with 1-sigma."""
     figure = figure_of(2.8)
@@ -163,7 +165,7 @@ def latency(
             when, 1e3 * (value - sigma), 1e3 * (value + sigma), color=colour[agent_id], alpha=0.18, linewidth=0
         )
         axes.plot(when, 1e3 * value, color=colour[agent_id], linewidth=1.0, label=f"drone {agent_id}")
-    axes.set(xlim=(0, duration_s), xlabel="time s", ylabel="ms")
+    axes.set(xlim=span_s, xlabel="time s", ylabel="ms")
     axes.legend(loc="upper right", ncols=4)
     return figure
 

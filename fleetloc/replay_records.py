@@ -15,6 +15,7 @@ from estimators.factory import make_estimator
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
 from sim_bridge.record_replay import RecordReplay, ReplayedTick, recorded_config, replay_record
+from sim_bridge.replay.naming import names_apart
 
 RECORDED = "recorded"
 """In place of a configuration: the one that each record was flown with."""
@@ -26,16 +27,17 @@ def replay_records(
 ) -> bool:
     """Repeat the runs of flight records and compare every estimate with the recorded one; whether all are equal.
 
-    Writes the estimates made again as ``agent_001.again.mcap`` and the comparison as ``report.json``. Another
-    configuration or ``overrides`` (``key=value``) answer what would have been estimated with them. Raises
-    `RecordError`, `ConfigError`, `InputError`.
+    Writes the estimates made again as ``agent_001.again.mcap`` (``A-agent_001.again.mcap`` where only their folders
+    tell records apart) and the comparison as ``report.json``. Another configuration or ``overrides`` (``key=value``)
+    answer what would have been estimated with them. Raises `RecordError`, `ConfigError`, `InputError`.
     """
     folder.mkdir(parents=True, exist_ok=True)
+    names = names_apart(records)
     rows = []
     for record in records:
         used = _config(config, record, overrides)
         agents = used or recorded_config(FlightReader(record).start, record)
-        path = folder / f"{record.stem}.again.mcap"
+        path = folder / f"{names[record].removesuffix(record.suffix).replace('/', '-')}.again.mcap"
         writer = EstimateMcap(path, agents.ids, agents.fleet.period_s, agents.fleet.epoch_unix_s)
 
         def write(agent_id: int, tick: ReplayedTick, writer: EstimateMcap = writer) -> None:

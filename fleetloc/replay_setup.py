@@ -17,6 +17,7 @@ from fleetloc.errors import InputError
 from sim_bridge.logs.events import LogSource, TruthSample
 from sim_bridge.logs.opening import open_log
 from sim_bridge.replay.feed import Inputs
+from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import Plan, Vehicle, make_plan
 from sim_bridge.replay.range_files import UNIX_FROM_S, RangeCounts, RangeLine, read_ranges
 from sim_bridge.replay.reading import surveyed
@@ -91,10 +92,12 @@ def prepare(options: Options) -> Prepared:
     from_s, to_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
     if not from_s < to_s:
         raise InputError("--from/--to", "", f"a part of {plan.end_s - plan.start_s:.1f} s", "nothing of it")
-    drops = GpsDrops([GpsDrop.parsed(text) for text in options.drops], config.ids, from_s, to_s)
+    flown = tuple(vehicle.agent_id for vehicle in plan.vehicles)
+    asked = [GpsDrop.parsed(text) for text in options.drops]
+    drops = GpsDrops(asked, flown, plan.start_s, plan.end_s, (from_s, to_s))
     truth = {v.agent_id: _fleet_timed(v, files[_key(v)], plan) for v in plan.vehicles} if files else None
     counts = RangeCounts()
-    ranges, ranges_from = _ranges(options, config, plan, from_s, counts)
+    ranges, ranges_from = _ranges(options, config, plan, counts)
     truth_files = {v.agent_id: files[_key(v)] for v in plan.vehicles} if files else {}
     return Prepared(
         config=config,
@@ -192,8 +195,10 @@ def _fleet_timed(vehicle: Vehicle, file: TruthFile, plan: Plan) -> Iterator[Trut
 
 def _truth_words(plan: Plan, files: dict[Key, TruthFile]) -> str:
     if files:
-        return "files " + ", ".join(files[_key(vehicle)].path.name for vehicle in plan.vehicles)
-    held = [f"{v.survey.truth_from} in {v.source.path.name}" for v in plan.vehicles if v.survey.truth_from]
+        names = names_apart(file.path for file in files.values())
+        return "files " + ", ".join(names[files[_key(vehicle)].path] for vehicle in plan.vehicles)
+    names = names_apart(vehicle.source.path for vehicle in plan.vehicles)
+    held = [f"{v.survey.truth_from} in {names[v.source.path]}" for v in plan.vehicles if v.survey.truth_from]
     return "; ".join(held) or "none"
 
 
@@ -201,7 +206,7 @@ def _truth_words(plan: Plan, files: dict[Key, TruthFile]) -> str:
 
 
 def _ranges(
-    options: Options, config: FleetConfig, plan: Plan, from_s: float, counts: RangeCounts
+    options: Options, config: FleetConfig, plan: Plan, counts: RangeCounts
 ) -> tuple[Iterator[RangeLine] | Synthesiser | None, str]:
     """What gives the ranges, and how the report names it."""
     if not options.ranges:
@@ -224,7 +229,7 @@ def _ranges(
         if first.time_s >= UNIX_FROM_S and plan.epoch_unix_s is None:
             expected = "seconds from the start, as no log knows the time"
             raise InputError(str(path), "time", expected, f"{first.time_s:.3f}")
-        streams.append(_fleet_timed_ranges(_read(path, counts), plan.epoch_unix_s or 0.0, from_s))
+        streams.append(_fleet_timed_ranges(_read(path, counts), plan))
     merged = heapq.merge(*streams, key=lambda line: line.time_s)
     return merged, f"file {', '.join(path.name for path in paths)}"
 
@@ -233,7 +238,8 @@ def _read(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:
     return ranges_of_record(path, counts) if path.suffix == RECORD_SUFFIX else read_ranges(path, counts)
 
 
-def _fleet_timed_ranges(lines: Iterator[RangeLine], epoch_unix_s: float, from_s: float) -> Iterator[RangeLine]:
+def _fleet_timed_ranges(lines: Iterator[RangeLine], plan: Plan) -> Iterator[RangeLine]:
+    """Ranges on fleet time; small times count from the start of the logs."""
     for line in lines:
-        shift_s = -epoch_unix_s if line.time_s >= UNIX_FROM_S else from_s
+        shift_s = -(plan.epoch_unix_s or 0.0) if line.time_s >= UNIX_FROM_S else plan.start_s
         yield replace(line, time_s=line.time_s + shift_s)

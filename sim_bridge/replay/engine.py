@@ -43,6 +43,8 @@ class ReplayCounts:
     ranges: Counter[str] = field(default_factory=Counter)
     leaps: int = 0
     """Silences that were left out."""
+    left_out_s: float = 0.0
+    """How long they were together."""
     last_s: float = 0.0
     """Fleet time of the last event."""
 
@@ -98,12 +100,14 @@ class Replay:
     # --- events ---------------------------------------------------------------------------------------------
 
     def _schedule_agents(self) -> None:
-        """Each agent runs while its log does."""
+        """Each agent runs while its log does, as far as that is replayed."""
         for vehicle in self._inputs.plan.vehicles:
             first_s = max(vehicle.first_s, self._inputs.from_s)
-            member = self.members[vehicle.agent_id]
-            self._queue.at(first_s, functools.partial(self._fleet.join, member))
             last_s = vehicle.last_s + LINGER_TICKS * self._period_s
+            if last_s <= first_s:
+                self._left.add(vehicle.agent_id)
+                continue
+            self._queue.at(first_s, functools.partial(self._fleet.join, self.members[vehicle.agent_id]))
             self._queue.at(last_s, functools.partial(self._leave, vehicle.agent_id))
 
     def _leave(self, agent_id: int) -> None:
@@ -115,6 +119,7 @@ class Replay:
         self._queue.run_until(last_s + self._ahead_s)
         self._queue.leap(now_s - self._ahead_s)
         self._counts.leaps += 1
+        self._counts.left_out_s += now_s - last_s - 2 * self._ahead_s
 
     def _take(self, now_s: float, agent_id: int, heard: Heard) -> None:
         if isinstance(heard, RangeLine):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from agent.config_tables import FleetConfig
 from sim_bridge.logs.events import LogSource, LogSurvey, SystemSurvey
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.naming import names_apart
 
 LEAD_S = 10.0
 """Fleet time of the earliest log's beginning: a time of zero would leave no room for stamps before it."""
@@ -72,7 +73,7 @@ def make_plan(config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: di
     surveys = [source.survey() for source in sources]
     found = [(k, system) for k, survey in enumerate(surveys) for _, system in sorted(survey.systems.items())]
     if not found:
-        raise ReplayError(", ".join(source.path.name for source in sources), "a vehicle", "none")
+        raise ReplayError(", ".join(names_apart(s.path for s in sources).values()), "a vehicle", "none")
     agents = _assigned(config, [system.system_id for _, system in found])
     zeros, epoch_s, clocks = _aligned(sources, surveys, unix_zero_s or {})
     begin_s = min(zeros[k] + system.first_s for k, system in found)
@@ -125,6 +126,7 @@ def _aligned(
         zeros = [-survey.first_s for survey in surveys]
         return zeros, None, "no log knows the time: all begin together"
     earliest_s = min(zero + surveys[k].first_s for k, (zero, _) in known.items())
+    names = names_apart(source.path for source in sources)
     zeros, how = [], []
     for k, survey in enumerate(surveys):
         zero, by = known.get(k, (earliest_s - survey.first_s, "unknown, laid at the beginning of the others"))
@@ -134,5 +136,5 @@ def _aligned(
             raise ReplayError(sources[k].path, "a log of the same flight", found)
         zeros.append(zero)
         sigma = f" +- {survey.unix.sigma_s:.3f} s" if by in ("GPS time", "host's clock") else ""
-        how.append(f"{sources[k].path.name}: {by}{sigma}")
+        how.append(f"{names[sources[k].path]}: {by}{sigma}")
     return zeros, 0.0, "; ".join(how)

@@ -22,6 +22,7 @@ from sim_bridge import side_process
 from sim_bridge.logs.events import LogSource
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.feed import Arrival, Feed, Tallies
+from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.range_files import RangeLine
 
 BATCH = 500
@@ -53,7 +54,7 @@ def surveyed(sources: Sequence[LogSource]) -> list[LogSource]:
             with side_process.workers(len(sources)) as pool:
                 return list(pool.map(_surveyed, sources))
         except BrokenProcessPool:
-            names = ", ".join(source.path.name for source in sources)
+            names = ", ".join(names_apart(source.path for source in sources).values())
             raise ReplayError(names, "to be surveyed", "the surveying process was killed") from None
     return [_surveyed(source) for source in sources]
 
@@ -124,7 +125,7 @@ def _received(receiving: Connection, feed: Feed) -> Iterator[Arrival]:
                 yield arrival_s, agent_id, heard
         end = pickle.loads(receiving.recv_bytes())
     except EOFError:
-        names = ", ".join(dict.fromkeys(vehicle.source.path.name for vehicle in feed.inputs.plan.vehicles))
+        names = ", ".join(names_apart(vehicle.source.path for vehicle in feed.inputs.plan.vehicles).values())
         raise ReplayError(names, "to be read to the end", "the reading process was killed") from None
     if isinstance(end, Exception):
         raise end

@@ -62,17 +62,29 @@ def _bound(text: str, part: str | None) -> float | None:
 class GpsDrops:
     """All of them, in fleet time."""
 
-    def __init__(self, drops: list[GpsDrop], ids: tuple[int, ...], start_s: float, end_s: float) -> None:
-        """Raises `ReplayError` for an agent that is not in the fleet or a window without length."""
+    def __init__(
+        self,
+        drops: list[GpsDrop],
+        ids: tuple[int, ...],
+        start_s: float,
+        end_s: float,
+        part_s: tuple[float, float] = (-math.inf, math.inf),
+    ) -> None:
+        """``ids`` of the drones with a log, ``part_s`` of the logs' time that is replayed.
+
+        Raises `ReplayError` for another drone, and for a window without length in that part.
+        """
         self.windows: dict[int, list[tuple[float, float]]] = {}
         for drop in drops:
             if drop.agent_id not in ids:
-                raise ReplayError(OPTION, f"one of the agents {', '.join(map(str, ids))}", str(drop.agent_id))
-            from_s, to_s = drop.window.resolved(start_s, end_s)
-            from_s, to_s = max(from_s, start_s), min(to_s, end_s)
+                expected = f"a drone with a log ({', '.join(map(str, ids))})"
+                raise ReplayError(OPTION, expected, str(drop.agent_id))
+            asked_s = drop.window.resolved(start_s, end_s)
+            first_s, last_s = max(start_s, part_s[0]), min(end_s, part_s[1])
+            from_s, to_s = max(asked_s[0], first_s), min(asked_s[1], last_s)
             if not from_s < to_s:
-                found = f"{from_s - start_s:.1f} to {to_s - start_s:.1f} s"
-                raise ReplayError(OPTION, f"a part of the replay's {end_s - start_s:.1f} s", found)
+                expected = f"a part of what is replayed, {first_s - start_s:.1f} to {last_s - start_s:.1f} s"
+                raise ReplayError(OPTION, expected, f"{asked_s[0] - start_s:.1f} to {asked_s[1] - start_s:.1f} s")
             self.windows.setdefault(drop.agent_id, []).append((from_s, to_s))
 
     def holds(self, agent_id: int, t_s: float) -> bool:

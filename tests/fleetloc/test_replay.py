@@ -105,6 +105,35 @@ def test_estimates_are_written_as_csv_and_mcap(replayed: tuple[Path, dict[str, A
     assert topics["/agent_002/estimate"] == known
 
 
+def test_times_count_from_the_start_of_the_logs_whatever_part_is_replayed(tmp_path: Path) -> None:
+    # GIVEN two logs of one name, a range every 0.1 s from their start, and a drop of GPS
+    logs = [tmp_path / name / "00000001.tlog.gz" for name in ("a", "b")]
+    for log in logs:
+        log.parent.mkdir()
+        log.write_bytes(COPTER.read_bytes())
+    ranges = tmp_path / "ranges.csv"
+    ranges.write_text("time,observer,target,range_m\n" + "".join(f"{k / 10},1,2,3.0\n" for k in range(1, 51)))
+    # WHEN only seconds 2 to 4 are replayed
+    arguments = ["replay", pair_config(tmp_path), *logs, "--ranges", ranges, "--drop-gps", "2:3,9", "--from", 2,
+                 "--to", 4, "--out", tmp_path / "out"]  # fmt: skip
+    assert main([str(argument) for argument in arguments]) == 0
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    # THEN all times are those of the logs
+    assert (figures["from_s"], figures["to_s"]) == (2.0, pytest.approx(4.0, abs=0.1))
+    assert figures["gps_dropped"] == [{"agent": 2, "from_s": 3.0, "to_s": pytest.approx(5.5, abs=1.6)}]
+    assert figures["fleet"]["ranges"]["delivered"] == 21
+    with (tmp_path / "out" / "agent_001.csv").open() as file:
+        times_s = [float(row["time_s"]) for row in csv.DictReader(file)]
+    assert 2.0 <= times_s[0] < times_s[-1] <= 4.1
+    # and what was used and dropped is that of each log in this part
+    assert [log["file"] for log in figures["logs"]] == ["a/00000001.tlog.gz", "b/00000001.tlog.gz"]
+    assert [agent["log"] for agent in figures["agents"]] == ["a/00000001.tlog.gz", "b/00000001.tlog.gz"]
+    fixes = [agent["counters"]["gps: samples"] for agent in figures["agents"]]
+    dropped = figures["agents"][1]["counters"]["skipped gps: dropped on request"]
+    assert fixes[0] == fixes[1] + dropped > fixes[1] > 0 < dropped
+    assert all(log["used"]["1"]["imu"] > 100 for log in figures["logs"])
+
+
 def test_a_log_of_another_format_is_compared_with_its_autopilot(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -149,7 +178,7 @@ def _flipped(raw: bytes, share: float) -> bytes:
     [
         (b"", (), "an empty file"),
         (b"hello world, this is no log\n" * 40, (), "expected a flight log"),
-        (None, ("--drop-gps", "7"), "--drop-gps: expected one of the agents 1"),
+        (None, ("--drop-gps", "7"), "--drop-gps: expected a drone with a log (1)"),
         (None, ("--drop-gps", "1:x"), "--drop-gps: expected ID"),
         (None, ("--from", "1e6"), "--from/--to"),
         (None, ("--ranges", "synthetic:sigma=1"), "--ranges synthetic: expected"),
@@ -264,6 +293,18 @@ def test_a_flight_record_answers_what_another_estimator_would_have_said(
     (row,) = json.loads((tmp_path / "report.json").read_text())["records"]
     assert not row["equal"]
     assert row["compared"] > 10
+
+
+@pytest.mark.parametrize(
+    "option",
+    [("--drop-gps", "1"), ("--loss", "0.9"), ("--from", "1"), ("--ranges", "x.csv"), ("--arrival", "stamped")],
+)
+def test_what_cannot_be_asked_of_a_flight_record_is_refused(
+    flown: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, str]
+) -> None:
+    code, _, err = run(capsys, "replay", "recorded", flown / "agent_001.mcap", *option)
+    assert code == 2
+    assert f"{option[0]}: expected no such option" in err
 
 
 def test_flight_records_and_logs_are_not_mixed(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -128,6 +128,7 @@ class Run:
         drops: tuple[str, ...] = (),
         ranges: list[RangeLine] | None = None,
         synthetic: bool = True,
+        from_s: float = 0.0,
         to_s: float = math.inf,
         at_stamps: bool = False,
     ) -> None:
@@ -141,7 +142,8 @@ class Run:
         source: Synthesiser | list[RangeLine] | None = ranges
         if source is None and synthetic:
             source = Synthesiser({i: config.neighbours(i) for i in config.ids}, SyntheticNoise(), 1)
-        inputs = Inputs(plan, windows, plan.start_s, min(plan.end_s, plan.start_s + to_s), None, source, at_stamps)
+        end_s = min(plan.end_s, plan.start_s + to_s)
+        inputs = Inputs(plan, windows, plan.start_s + from_s, end_s, None, source, at_stamps)
         self.layout = Layout(config.ids)
         self.closed = 0
         self.replay = Replay(config, Feed(inputs, self), make_estimator, self.on_estimate)
@@ -250,6 +252,7 @@ def test_a_long_silence_is_left_out_and_the_agents_begin_anew_after_it() -> None
     # THEN no estimates are made up in between, and there are good ones after it
     times = np.array([ready.t_s - run.start_s for ready in run.estimates[1]])
     assert run.counts.leaps == 1
+    assert run.counts.left_out_s == pytest.approx(73.0, abs=0.1)
     assert np.count_nonzero((times > 6.0) & (times < 77.0)) < 5
     assert run.counts.members[1]["ticks: left out"] > 500
     assert np.sqrt(np.mean(run.errors_m(1, 82.0) ** 2)) < 0.2
@@ -268,6 +271,13 @@ def test_a_part_of_the_logs_can_be_replayed() -> None:
     run = Run(to_s=2.0)
     assert run.counts.last_s == pytest.approx(run.start_s + 2.0, abs=0.02)
     assert run.estimates[1][-1].t_s <= run.start_s + 2.2
+
+
+def test_a_drone_whose_log_ends_before_the_part_is_not_there() -> None:
+    run = Run(logs=(FlightLog(1, seconds=3.0), FlightLog(2), FlightLog(3)), from_s=5.0, to_s=8.0)
+    assert 1 not in run.estimates
+    assert run.estimates[2][-1].t_s > run.start_s + 7.5
+    assert np.sqrt(np.mean(run.errors_m(2, 7.0) ** 2)) < 0.15
 
 
 def test_samples_of_other_systems_in_a_log_are_not_taken() -> None:

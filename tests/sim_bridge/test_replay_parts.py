@@ -18,6 +18,7 @@ from agent.config_tables import FleetConfig
 from agent.frames import FleetFrame
 from sim_bridge.logs.events import Format, LogCounts, LogEvent, LogSurvey, SystemSurvey, UnixZero
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import LEAD_S, make_plan
 from sim_bridge.replay.statistics import Spread, Thinned
 from sim_bridge.replay.tracks import Track, TrackWriter
@@ -136,6 +137,19 @@ def test_a_drop_that_cannot_be_read_is_refused(text: str) -> None:
 def test_a_drop_of_nobody_or_of_no_time_is_refused(text: str) -> None:
     with pytest.raises(ReplayError, match="--drop-gps: expected"):
         GpsDrops([GpsDrop.parsed(text)], (1, 2), 100.0, 300.0)
+
+
+def test_a_drop_outside_of_what_is_replayed_is_refused_and_cut_at_its_edges() -> None:
+    drops = GpsDrops([GpsDrop.parsed("2:30,80")], (1, 2), 100.0, 300.0, (150.0, 200.0))
+    assert drops.windows == {2: [(150.0, 180.0)]}
+    with pytest.raises(ReplayError, match=r"a part of what is replayed, 50\.0 to 100\.0 s, found 120\.0 to 130\.0 s"):
+        GpsDrops([GpsDrop.parsed("2:120,130")], (1, 2), 100.0, 300.0, (150.0, 200.0))
+
+
+def test_files_of_one_name_are_told_apart_by_their_folders() -> None:
+    assert names_apart([Path("x/a.BIN"), Path("y/b.BIN")]) == {Path("x/a.BIN"): "a.BIN", Path("y/b.BIN"): "b.BIN"}
+    alike = [Path("day/1/a.BIN"), Path("day/2/a.BIN"), Path("day/2/a.BIN"), Path("a.BIN")]
+    assert list(names_apart(alike).values()) == ["1/a.BIN", "2/a.BIN", "a.BIN"]
 
 
 def test_an_open_window_is_infinite() -> None:

@@ -291,5 +291,5 @@ def test_a_log_that_cannot_be_surveyed_is_named() -> None:
 
 
 def test_a_survey_that_is_killed_is_one_clear_error() -> None:
-    with pytest.raises(ReplayError, match=r"made\.tlog, made\.tlog: expected to be surveyed"):
-        surveyed([Killed(3), Killed(3)])
+    with pytest.raises(ReplayError, match=r"made\.tlog, other\.tlog: expected to be surveyed"):
+        surveyed([Killed(3), Killed(3, path=Path("other.tlog"))])

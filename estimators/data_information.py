@@ -11,9 +11,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.compiled import entry, kernel
 from estimators.layout import STATES_PER_AGENT
-from estimators.marginalization import filter_along
-from estimators.measurements import Matrix
+from estimators.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
+from estimators.measurements import ROW, Matrix, RowTable
+from estimators.motion import predict_information
+from estimators.row_kernels import IntArray
+from estimators.window_kernels import add_row_information
 from estimators.window_types import WindowProblem
 
 START_SIGMA_M = 100.0
@@ -40,34 +44,75 @@ class DataInformation:
 
         ``path`` ``(N+1, 6n)``: where rows are linearised. ``slide``: whether the window's start moves on by a tick.
         """
-        n = len(problem.vector)
-        following, vector, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
-        sound = filter_along(
+        following = np.empty_like(self.information)
+        observable = np.zeros(len(following) // STATES_PER_AGENT, np.bool_)
+        sound = _filter_information(
             problem.rows,
             problem.start,
-            problem.accel,
             problem.accel_variance,
             np.ascontiguousarray(path),
             problem.period_s,
             eps,
             self.information,
-            np.zeros(n),
             following,
-            vector,
-            covariance,
+            observable,
         )
         if not sound:
-            self.information = no_information(n // STATES_PER_AGENT)
-            return np.zeros(n // STATES_PER_AGENT, np.bool_)
-        if slide:
+            self.information = no_information(len(observable))
+        elif slide:
             self.information = following
-        return observable_agents(covariance)
+        return observable
 
 
-def observable_agents(covariance: Matrix) -> NDArray[np.bool_]:
-    """Agents ``(n,)`` whose position is known along every direction, given a covariance without a prior."""
-    agents = len(covariance) // STATES_PER_AGENT
-    blocks = covariance.reshape(agents, STATES_PER_AGENT, agents, STATES_PER_AGENT)
-    positions = np.array([blocks[s, :3, s, :3] for s in range(agents)])
-    worst = np.linalg.eigvalsh(positions)[:, -1]
-    return np.asarray(worst <= OBSERVABLE_SIGMA_M**2)
+@entry(
+    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1],"
+    " float64[:, ::1], boolean[::1])",
+    ROW=ROW,
+)
+def _filter_information(
+    rows: RowTable,
+    start: IntArray,
+    accel_variance: Matrix,
+    path: Matrix,
+    dt: float,
+    eps: float,
+    information: Matrix,
+    following: Matrix,
+    observable: NDArray[np.bool_],
+) -> bool:
+    """`marginalization.filter_along` for the information alone, which depends on no value that was measured.
+
+    ``following`` gets that of the window's second tick before its rows, ``observable`` what its last tick allows.
+    False, and ``observable`` as it was, where the information is not positive definite.
+    """
+    info = information.copy()
+    ticks = accel_variance.shape[0]
+    for k in range(ticks):
+        add_row_information(rows[start[k] : start[k + 1]], path[k], eps, info)
+        if not predict_information(info, accel_variance[k], dt):
+            return False
+        if k == 0:
+            following[:, :] = info
+    add_row_information(rows[start[ticks] : start[ticks + 1]], path[ticks], eps, info)
+    if not factor_upper(info):
+        return False
+    covariance = np.empty_like(info)
+    inverse_from_cholesky(info, covariance)
+    mark_observable(covariance, observable)
+    return True
+
+
+@kernel
+def mark_observable(covariance: Matrix, observable: NDArray[np.bool_]) -> None:
+    """observable ``(n,)`` <- whose position is known along every direction, given a covariance without a prior.
+
+    No variance of a position reaches the limit where the limit's sphere less its covariance is positive definite.
+    """
+    room = np.empty((3, 3))
+    for s in range(observable.shape[0]):
+        p = STATES_PER_AGENT * s
+        for i in range(3):
+            for j in range(3):
+                room[i, j] = -covariance[p + i, p + j]
+            room[i, i] += OBSERVABLE_SIGMA_M**2
+        observable[s] = cholesky_upper(room)

@@ -11,6 +11,7 @@ from estimators.row_kernels import PRECISION
 from estimators.window_problem import (
     Trajectory,
     Window,
+    correction_hessian,
     empty_trajectory,
     gradient,
     hessian,
@@ -43,6 +44,15 @@ def set_weights(window: Window, path: Trajectory) -> None:
     for r in range(window.code.shape[0]):
         path.weights[r] = window.data[r, PRECISION] * path.residuals[r]
         path.predicted_weights[r] = 0.0
+
+
+@kernel
+def _fill_hessian(window: Window, path: Trajectory, exact: bool, h: Matrix) -> None:
+    """Upper triangle of h <- Gauss-Newton or exact Hessian, see `estimators.window_problem.hessian`."""
+    if window.gains.shape[0] == 0 and window.noise_precision.shape[0] > 0:
+        correction_hessian(window, path, exact, h)
+    else:
+        hessian(window, path, exact, h, np.empty((path.states.size, h.shape[0])))
 
 
 @kernel
@@ -94,7 +104,6 @@ def minimise(
     g = np.empty(n)
     h = np.empty((n, n))
     factor = np.empty((n, n))
-    sens = np.empty((path.states.size, n))
     trial = np.empty(n)
     value = roll_out(window, z, path)
     damping = 0.0
@@ -105,7 +114,7 @@ def minimise(
         set_weights(window, path)
         gradient(window, z, path, g)
         exact = linearisations > 0
-        hessian(window, path, exact, h, sens)
+        _fill_hessian(window, path, exact, h)
         creeping = linearisations > PATIENCE
         if exact:
             # Gauss-Newton replaces an indefinite Hessian: it keeps to the basin of the start. Where it creeps
@@ -118,7 +127,7 @@ def minimise(
             if exact:
                 damping = shift
             else:
-                hessian(window, path, False, h, sens)
+                _fill_hessian(window, path, False, h)
         if not exact:
             while not _damped_factor(h, damping, factor):
                 damping = max(1e-6, 10.0 * damping)

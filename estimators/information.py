@@ -72,10 +72,18 @@ def usable_pairs(
     return usable, len(timely) - len(usable)
 
 
+def fits(pair: Payload, dimension: int) -> bool:
+    """Whether a pair is one of ``dimension`` states, with counts that can be."""
+    return (
+        pair.information.shape == (dimension, dimension)
+        and pair.vector.shape == (dimension,)
+        and pair.rank >= 0
+        and pair.degree >= 0
+    )
+
+
 def _can_be_fused(pair: Payload, dimension: int) -> bool:
-    if pair.information.shape != (dimension, dimension) or pair.vector.shape != (dimension,):
-        return False
-    if pair.rank < 0 or pair.degree < 0 or not np.isfinite(pair.vector).all():
+    if not fits(pair, dimension) or not np.isfinite(pair.vector).all():
         return False
     return is_definite(np.ascontiguousarray(pair.information, np.float64))
 

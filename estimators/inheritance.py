@@ -12,16 +12,70 @@ The own marginal on S is untouched, and no datum enters it a second time.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from math import isnan
+
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.compiled import entry, kernel
-from estimators.estimator import symmetrised
+from estimators.estimator import Payload, symmetrised
+from estimators.information import fits
 from estimators.layout import STATES_PER_AGENT
 from estimators.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
 from estimators.measurements import Matrix, Vector
 
 WORTHWHILE_NATS = 0.2
 """Difference in log determinant of a 6x6 marginal covariance from which on a neighbour knows an agent better."""
+
+
+def survey(
+    own: Matrix, pairs: Mapping[int, Payload], slot: int, threshold: float = WORTHWHILE_NATS
+) -> tuple[dict[int, Payload], bool]:
+    """Of neighbours' pairs, by slot, those that can be fused, and whether one of them knows an agent better.
+
+    The best informed first, whatever its place: what is made of them does not depend on the agents' order. ``own``
+    ``(6n, 6n)`` is the own information, of the same tick; ``slot`` the own place, which nobody knows better.
+    """
+    n = len(own)
+    fitting = [each for each, pair in pairs.items() if fits(pair, n)]
+    informations, vectors = np.empty((len(fitting), n, n)), np.empty((len(fitting), n))
+    for place, each in enumerate(fitting):
+        informations[place], vectors[place] = pairs[each].information, pairs[each].vector
+    log_dets = np.empty(len(fitting))
+    better = _compare(np.ascontiguousarray(own), informations, vectors, slot, threshold, log_dets)
+    known = {each: known for each, known in zip(fitting, log_dets.tolist(), strict=True) if not isnan(known)}
+    return {each: pairs[each] for each in sorted(known, key=known.__getitem__, reverse=True)}, better
+
+
+@entry("boolean(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], int64, float64, float64[::1])")
+def _compare(
+    own: Matrix, informations: NDArray[np.float64], vectors: Matrix, slot: int, threshold: float, log_dets: Vector
+) -> bool:
+    """Whether one of the pairs knows another agent than ``slot`` better than ``own``.
+
+    ``log_dets`` ``(J,)`` gets the informations' log determinants, NaN for a pair that cannot be fused.
+    """
+    n = own.shape[0]
+    agents = n // STATES_PER_AGENT
+    root, covariance, uncertainty = own.copy(), np.empty((n, n)), np.full(agents, -np.inf)
+    if factor_upper(root):
+        inverse_from_cholesky(root, covariance)
+        for k in range(agents):
+            uncertainty[k] = -np.inf if k == slot else _log_det(covariance, k)
+    better = False
+    for p in range(log_dets.shape[0]):
+        log_dets[p] = np.nan
+        root[:, :] = informations[p]
+        if not np.isfinite(vectors[p]).all() or not factor_upper(root):
+            continue
+        log_dets[p] = 0.0
+        for i in range(n):
+            log_dets[p] += 2.0 * np.log(root[i, i])
+        inverse_from_cholesky(root, covariance)
+        for k in range(agents):
+            better = better or uncertainty[k] - _log_det(covariance, k) > threshold
+    return better
 
 
 def inherit(

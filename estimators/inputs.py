@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
-import numpy as np
+from collections.abc import Mapping
 
-from estimators.measurements import Matrix, Vector
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.compiled import entry, kernel
+from estimators.measurements import INPUT, InputTable, Matrix, empty_inputs
+from estimators.row_kernels import IntArray
 
 HISTORY_TICKS = 50
 """How far back accelerations are kept, to hold the last one and to learn how fast they change."""
@@ -24,65 +29,147 @@ class InputHistory:
     """
 
     def __init__(self, agents: int, other_variance: float, *, hold: bool, fade: float = 1.0) -> None:
-        self._known: list[dict[int, tuple[Vector, Vector]]] = [{} for _ in range(agents)]
+        self._known: InputTable = empty_inputs()
+        """By tick, then agent."""
+        self._agents = agents
         self._other_variance = other_variance
         self._hold = hold
         self._fade = fade
 
-    def insert(self, tick: int, slot: int, accel: Vector, variance: Vector) -> None:
-        """Store an acceleration ``(3,)``, NED m/s2, over the tick that starts at ``tick``, and its variance."""
-        self._known[slot].setdefault(tick, (accel.copy(), variance.copy()))
+    def insert(self, inputs: InputTable, first: int) -> tuple[int, int]:
+        """Store accelerations; gives how many were refused, and how many dropped: those before ``first``."""
+        if not len(inputs):
+            return 0, 0
+        table = np.empty(len(self._known) + len(inputs), INPUT)
+        new = np.ascontiguousarray(inputs, INPUT)
+        count, refused, dropped = _take_in(table, self._known, new, self._agents, first)
+        self._known = table[:count]
+        return refused, dropped
 
     def forget_before(self, tick: int) -> None:
         """Drop what is older than ``tick`` (with ``hold``, older than the history)."""
         limit = tick - (HISTORY_TICKS if self._hold else 0)
-        for known in self._known:
-            for old in [each for each in known if each < limit]:
-                del known[old]
+        if len(self._known) and self._known["tick"][0] < limit:
+            self._known = self._known[np.searchsorted(self._known["tick"], limit) :]
+
+    def take_over(self, other: InputHistory, slots: Mapping[int, int]) -> None:
+        """Know of each slot in ``slots`` what another history knows of the slot that it stands for there."""
+        known = other._known
+        parts = [known[known["agent"] == there] for there in slots.values()]
+        for slot, part in zip(slots, parts, strict=True):
+            part["agent"] = slot
+        table = np.concatenate([empty_inputs(), *parts])
+        self._known = np.ascontiguousarray(table[np.lexsort((table["agent"], table["tick"]))], INPUT)
 
     def table(self, first: int, last: int) -> tuple[Matrix, Matrix]:
         """Accelerations ``(last - first, 3n)`` over the ticks from ``first`` on, and their variances."""
-        ticks, n = last - first, len(self._known)
-        accel = np.zeros((ticks, 3 * n))
-        variance = np.full((ticks, 3 * n), self._other_variance)
-        for slot, known in enumerate(self._known):
-            columns = slice(3 * slot, 3 * slot + 3)
-            missing = []
-            for k in range(ticks):
-                found = known.get(first + k)
-                if found is None:
-                    missing.append(k)
-                else:
-                    accel[k, columns], variance[k, columns] = found
-            change = self._mean_square_change(slot) if self._hold and missing else None
-            if change is None:
-                continue
-            for k in missing:
-                held = self._held(slot, first + k, change)
-                if held is not None:
-                    accel[k, columns], variance[k, columns] = held
+        shape = last - first, 3 * self._agents
+        accel, variance = np.empty(shape), np.empty(shape)
+        _fill(self._known, first, self._other_variance, self._hold, self._fade, accel, variance)
         return accel, variance
 
-    def _held(self, slot: int, tick: int, change: float) -> tuple[Vector, Vector] | None:
-        """The last acceleration known before ``tick``, with the variance of holding it.
 
-        ``change``: mean square of what one tick changes.
-        """
-        known = self._known[slot]
-        before = [each for each in known if each < tick]
-        if not before:
-            return None
-        last = max(before)
-        accel, variance = known[last]
-        held = tick - last
-        return accel * self._fade**held, np.minimum(variance + change * held**2, self._other_variance)
+@entry("UniTuple(int64, 3)(INPUT[::1], INPUT[::1], INPUT[::1], int64, int64)", INPUT=INPUT)
+def _take_in(
+    table: InputTable, known: InputTable, inputs: InputTable, agents: int, first: int
+) -> tuple[int, int, int]:
+    """``table`` <- what is ``known``, sorted, and the inputs, of equal ones the earliest.
 
-    def _mean_square_change(self, slot: int) -> float | None:
-        """Mean square per axis of what a tick changes beyond the fading, the sensor's noise included.
+    Gives the number of them, how many inputs no estimator could use, and how many were of ticks before ``first``.
+    """
+    count, refused, dropped = known.shape[0], 0, 0
+    for i in range(count):
+        table[i] = known[i]
+    for r in range(inputs.shape[0]):
+        tick, agent = inputs[r]["tick"], inputs[r]["agent"]
+        usable = 0 <= agent < agents
+        for axis in range(3):
+            variance = inputs[r]["variance"][axis]
+            usable = usable and np.isfinite(inputs[r]["accel"][axis]) and np.isfinite(variance) and variance > 0.0
+        if not usable:
+            refused += 1
+            continue
+        if tick < first:
+            dropped += 1
+            continue
+        at = count
+        while at > 0 and (table[at - 1]["tick"], table[at - 1]["agent"]) > (tick, agent):
+            at -= 1
+        if at > 0 and table[at - 1]["tick"] == tick and table[at - 1]["agent"] == agent:
+            continue  # known already
+        for i in range(count, at, -1):
+            table[i] = table[i - 1]
+        table[at] = inputs[r]
+        count += 1
+    return count, refused, dropped
 
-        Summed in the order of time: that of arrival would show in the last bits.
-        """
-        known = self._known[slot]
-        pairs = [tick for tick in sorted(known) if tick + 1 in known]
-        changes = [known[tick + 1][0] - self._fade * known[tick][0] for tick in pairs]
-        return float(np.mean(np.square(changes))) if len(changes) >= CHANGES_NEEDED else None
+
+@entry(
+    "void(INPUT[::1], int64, float64, boolean, float64, float64[:, ::1], float64[:, ::1])",
+    INPUT=INPUT,
+)
+def _fill(
+    known: InputTable, first: int, other_variance: float, hold: bool, fade: float, accel: Matrix, variance: Matrix
+) -> None:
+    """`InputHistory.table`, both ``(ticks, 3n)``, from what is ``known``, sorted by tick."""
+    ticks, agents = accel.shape[0], accel.shape[1] // 3
+    missing = np.ones((agents, ticks), np.bool_)
+    accel[:, :] = 0.0
+    variance[:, :] = other_variance
+    for r in range(known.shape[0]):
+        k, agent = known[r]["tick"] - first, known[r]["agent"]
+        if 0 <= k < ticks:
+            missing[agent, k] = False
+            for axis in range(3):
+                accel[k, 3 * agent + axis] = known[r]["accel"][axis]
+                variance[k, 3 * agent + axis] = known[r]["variance"][axis]
+    if hold:
+        for agent in range(agents):
+            if missing[agent].any():
+                _hold_last(known, agent, missing[agent], first, other_variance, fade, accel, variance)
+
+
+@kernel
+def _hold_last(
+    known: InputTable,
+    agent: int,
+    missing: NDArray[np.bool_],
+    first: int,
+    other_variance: float,
+    fade: float,
+    accel: Matrix,
+    variance: Matrix,
+) -> None:
+    """Fill the ``missing`` ticks of an agent with its last acceleration before, and the variance of holding it."""
+    own = np.flatnonzero(known["agent"] == agent)
+    change = _mean_square_change(known, own, fade)
+    if np.isnan(change):
+        return
+    for k in np.flatnonzero(missing):
+        earlier = 0
+        while earlier < own.shape[0] and known[own[earlier]]["tick"] < first + k:
+            earlier += 1
+        if earlier == 0:
+            continue
+        last = known[own[earlier - 1]]
+        held = float(first + k - last["tick"])
+        for axis in range(3):
+            grown = last["variance"][axis] + change * held**2
+            accel[k, 3 * agent + axis] = last["accel"][axis] * fade**held
+            variance[k, 3 * agent + axis] = min(grown, other_variance)
+
+
+@kernel
+def _mean_square_change(known: InputTable, own: IntArray, fade: float) -> float:
+    """Mean square per axis of what a tick changes beyond the fading, the sensor's noise included.
+
+    ``own``: places of one agent's accelerations, in the order of time. NaN where too few changes are known.
+    """
+    total, changes = 0.0, 0
+    for i in range(own.shape[0] - 1):
+        before, after = known[own[i]], known[own[i + 1]]
+        if after["tick"] == before["tick"] + 1:
+            changes += 1
+            for axis in range(3):
+                total += (after["accel"][axis] - fade * before["accel"][axis]) ** 2
+    return total / (3 * changes) if changes >= CHANGES_NEEDED else np.nan

@@ -26,14 +26,22 @@ manoeuvres: with a good receiver it was wrong by 4 to 7 of its sigmas.)
 from __future__ import annotations
 
 import math
-from collections import deque
 from dataclasses import dataclass
 from enum import Enum, auto
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from estimators.latency_kernels import HALF_S, STATES, fill_integrals, move_bank, update_bank
+from estimators.latency_kernels import (
+    HALF_S,
+    STATES,
+    fill_integrals,
+    largest_density,
+    measure_excitation,
+    move_bank,
+    update_bank,
+    weigh_latencies,
+)
 from estimators.measurements import Matrix, Vector
 
 Pair = tuple[float, float]
@@ -100,26 +108,30 @@ class AccelerationHistory:
 
     def __init__(self, keep_s: float) -> None:
         self._keep_s = keep_s
-        self._rows: deque[tuple[float, float, float, float, float]] = deque()
-        self._table: Matrix | None = None
+        self._pieces: Matrix = np.empty((0, 5))
+        """Start, end, north, east, variance ``(pieces, 5)``."""
 
     def add(self, start_s: float, end_s: float, accel_mps2: Pair, variance: float) -> None:
         """Append a piece with the variance of its mean in (m/s2)2; one that does not adjoin begins a new history."""
-        if self._rows and abs(self._rows[-1][1] - start_s) > ROUNDING_S:
-            self._rows.clear()
-        self._rows.append((start_s, end_s, *accel_mps2, variance))
-        while self._rows[0][1] < end_s - self._keep_s:
-            self._rows.popleft()
-        self._table = None
+        known = len(self._pieces)
+        first = 0 if abs(self.end_s - start_s) <= ROUNDING_S else known
+        while first < known and self._pieces[first, 1] < end_s - self._keep_s:
+            first += 1
+        pieces = np.empty((known - first + 1, 5))
+        pieces[:-1] = self._pieces[first:]
+        pieces[-1] = (start_s, end_s, *accel_mps2, variance)
+        self._pieces = pieces
 
     def covers(self, from_s: float, to_s: float) -> bool:
         """Whether a span is known throughout."""
-        return bool(self._rows) and self._rows[0][0] - ROUNDING_S <= from_s and to_s <= self.end_s + ROUNDING_S
+        if not len(self._pieces):
+            return False
+        return bool(self._pieces[0, 0] - ROUNDING_S <= from_s and to_s <= self.end_s + ROUNDING_S)
 
     @property
     def end_s(self) -> float:
         """Until when it is known."""
-        return self._rows[-1][1] if self._rows else -math.inf
+        return float(self._pieces[-1, 1]) if len(self._pieces) else -math.inf
 
     def integrals(self, from_s: Vector, to_s: Vector) -> tuple[Matrix, Matrix]:
         """What the acceleration, averaged over ``SMOOTH_S`` about each instant, adds over spans ``(k,)``.
@@ -129,7 +141,7 @@ class AccelerationHistory:
         chance; true accelerations of a drone hardly change within the average.
         """
         gained, moved = np.empty((len(from_s), 2)), np.empty((len(from_s), 2))
-        fill_integrals(self._pieces(), from_s, to_s, gained, moved)
+        fill_integrals(self._pieces, from_s, to_s, gained, moved)
         return gained, moved
 
     def excitation(self, about_s: float) -> tuple[float, float]:
@@ -137,23 +149,11 @@ class AccelerationHistory:
 
         With it comes the variance per axis that noise has in the acceleration about the instant.
         """
-        table = self._pieces()
-        near = table[np.abs(0.5 * (table[:, 0] + table[:, 1]) - about_s) <= HALF_S]
-        if not len(near):
-            return 0.0, 1.0
-        north, east = near[:, 2:4].sum(axis=0) / len(near) - table[:, 2:4].sum(axis=0) / len(table)
-        return float(north * north + east * east), float(near[:, 4].sum()) / len(near) ** 2
+        return measure_excitation(self._pieces, about_s)
 
     def velocity_density(self) -> float:
         """Growth of the velocity's variance per axis by white noise, (m/s)2 per s; that of the worst piece."""
-        table = self._pieces()
-        return float(((table[:, 1] - table[:, 0]) * table[:, 4]).max())
-
-    def _pieces(self) -> Matrix:
-        """Start, end, north, east, variance ``(pieces, 5)``."""
-        if self._table is None:
-            self._table = np.array(self._rows)
-        return self._table
+        return largest_density(self._pieces)
 
 
 class LatencyEstimator:
@@ -177,11 +177,13 @@ class LatencyEstimator:
         fine = np.linspace(-GRID_SIGMAS, GRID_SIGMAS, FINE_POINTS)
         self.grid_s: Vector = prior_s + prior_sigma_s * offsets
         self._fine_s: Vector = prior_s + prior_sigma_s * fine
+        self._log_prior: Vector = -0.5 * offsets**2
         self._fine_log_prior: Vector = -0.5 * fine**2
-        self._interpolation: Matrix = np.asarray(CubicSpline(offsets, np.eye(GRID_POINTS))(fine))
+        self._interpolation: Matrix = np.ascontiguousarray(CubicSpline(offsets, np.eye(GRID_POINTS))(fine))
         # The tails are cut off: without data the spread of the weights would be a little less than the prior's.
         self._spread = 1.0
         self._log_likelihood: Vector = np.zeros(GRID_POINTS)
+        self._weights: Vector = np.empty(GRID_POINTS)
         self._weigh()
         self._spread = prior_sigma_s / self.sigma_s
         self._weigh()
@@ -255,7 +257,6 @@ class LatencyEstimator:
         """Move each filter on from the last fix's instant to this one's, as it believes them to be."""
         duration_s = fix.stamp_s - last_s
         gained, moved = self.history.integrals(last_s - self.grid_s, fix.stamp_s - self.grid_s)
-        kept = np.exp(-self._rate * duration_s)
         grown = self.history.velocity_density() * duration_s
         wander = 2.0 * fix.position_variance_m2 / self._model.wander_s * duration_s
         move_bank(
@@ -265,12 +266,12 @@ class LatencyEstimator:
             gained,
             moved,
             duration_s,
-            kept,
-            (1.0 - kept * kept) * self._stationary,
+            self._rate,
+            self._stationary,
             grown,
             wander,
         )
-        self._log_likelihood = self._log_likelihood * math.exp(-duration_s / self._model.memory_s)
+        self._log_likelihood *= math.exp(-duration_s / self._model.memory_s)
 
     def _manoeuvre(self, instant_s: float) -> float:
         """How much a fix counts, 0 to 1: the share of the squared acceleration that its errors cannot explain."""
@@ -289,22 +290,23 @@ class LatencyEstimator:
             self._renew(part, value, variance)
             return Outcome.RESTARTED
         self._rejected[name] = 0
-        self._log_likelihood = self._log_likelihood - 0.5 * self._share * squares
+        self._log_likelihood -= 0.5 * self._share * squares
         return Outcome.USED
 
     def _weigh(self) -> None:
         """Weights, mean and spread of the latency from the likelihoods and the prior."""
-        self._log_likelihood = self._log_likelihood - self._log_likelihood.max()
-        log_weights = self._interpolation @ self._log_likelihood + self._fine_log_prior
-        weights = np.exp(log_weights - log_weights.max())
-        weights /= weights.sum()
-        mean = float(weights @ self._fine_s)
+        mean, sigma = weigh_latencies(
+            self._log_likelihood,
+            self._log_prior,
+            self._interpolation,
+            self._fine_s,
+            self._fine_log_prior,
+            self._weights,
+        )
         self.latency_s = mean
         """How much older values are than their stamps."""
-        self.sigma_s = self._spread * math.sqrt(float(weights @ (self._fine_s - mean) ** 2))
+        self.sigma_s = self._spread * sigma
         """1-sigma of ``latency_s``."""
-        coarse = np.exp(self._log_likelihood - 0.5 * np.linspace(-GRID_SIGMAS, GRID_SIGMAS, GRID_POINTS) ** 2)
-        self._weights: Vector = coarse / coarse.sum()
 
     def _check(self, fix: Fix) -> None:
         values = (fix.stamp_s, *fix.position_m, *(fix.velocity_mps or ()))

@@ -49,6 +49,67 @@ def fill_integrals(table: Matrix, from_s: Vector, to_s: Vector, gained: Matrix, 
             moved[j, axis] = end_place - start_place - (to_s[j] - from_s[j]) * start_speed
 
 
+@entry("UniTuple(float64, 2)(float64[:, ::1], float64)")
+def measure_excitation(table: Matrix, about_s: float) -> tuple[float, float]:
+    """See `estimators.latency.AccelerationHistory.excitation`; ``table`` as in `fill_integrals`."""
+    pieces, near = table.shape[0], 0
+    north, east, near_north, near_east, variance = 0.0, 0.0, 0.0, 0.0, 0.0
+    for k in range(pieces):
+        north += table[k, 2]
+        east += table[k, 3]
+        if abs(0.5 * (table[k, 0] + table[k, 1]) - about_s) <= HALF_S:
+            near += 1
+            near_north += table[k, 2]
+            near_east += table[k, 3]
+            variance += table[k, 4]
+    if near == 0:
+        return 0.0, 1.0
+    north, east = near_north / near - north / pieces, near_east / near - east / pieces
+    return north * north + east * east, variance / near**2
+
+
+@entry("float64(float64[:, ::1])")
+def largest_density(table: Matrix) -> float:
+    """Largest product of a piece's length and its variance; ``table`` as in `fill_integrals`."""
+    largest = 0.0
+    for k in range(table.shape[0]):
+        largest = max(largest, (table[k, 1] - table[k, 0]) * table[k, 4])
+    return largest
+
+
+@entry(
+    "UniTuple(float64, 2)(float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[::1], float64[::1])"
+)
+def weigh_latencies(
+    log_likelihood: Vector,
+    log_prior: Vector,
+    interpolation: Matrix,
+    fine_s: Vector,
+    fine_log_prior: Vector,
+    weights: Vector,
+) -> tuple[float, float]:
+    """Mean and sigma of the latency in s, on the fine grid ``(f,)``.
+
+    ``log_likelihood`` ``(k,)``, whose largest becomes 0, is brought there by ``interpolation`` ``(f, k)``.
+    ``weights`` ``(k,)`` gets those of the filters.
+    """
+    log_likelihood -= log_likelihood.max()
+    weights[:] = np.exp(log_likelihood + log_prior)
+    weights /= weights.sum()
+    fine = fine_log_prior.copy()
+    for i in range(fine.shape[0]):
+        for k in range(log_likelihood.shape[0]):
+            fine[i] += interpolation[i, k] * log_likelihood[k]
+    fine = np.exp(fine - fine.max())
+    fine /= fine.sum()
+    mean, square = 0.0, 0.0
+    for i in range(fine.shape[0]):
+        mean += fine[i] * fine_s[i]
+    for i in range(fine.shape[0]):
+        square += fine[i] * (fine_s[i] - mean) ** 2
+    return mean, np.sqrt(square)
+
+
 @entry(
     "void(float64[:, ::1], float64[:, ::1], float64[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1],"
     " float64[::1], float64, float64)"
@@ -60,22 +121,23 @@ def move_bank(
     gained: Matrix,
     moved: Matrix,
     duration_s: float,
-    kept: Vector,
-    renewed: Vector,
+    rate: Vector,
+    stationary: Vector,
     grown: float,
     wander: float,
 ) -> None:
     """Move all filters on by a time, in place.
 
     ``means`` ``(k, 7)``, ``covariance`` ``(7, 7)``, ``weights`` ``(k,)``; ``gained``, ``moved`` ``(k, 2)`` is what
-    the acceleration adds to velocity and position. Of bias and heading ``(3,)`` the share ``kept`` stays and the
-    variance ``renewed`` is added; ``grown`` is that of the velocity per axis, ``wander`` that of the position.
+    the acceleration adds to velocity and position. Bias and heading ``(3,)`` fade at the ``rate``, 1/s, towards their
+    ``stationary`` variance; the variance ``grown`` is added to the velocity per axis, ``wander`` to the position.
     """
     transition = np.eye(STATES)
     for axis in range(2):
         transition[axis, 2 + axis] = duration_s
         transition[axis, 4 + axis] = -0.5 * duration_s * duration_s
         transition[2 + axis, 4 + axis] = -duration_s
+    kept = np.exp(-rate * duration_s)
     for i in range(3):
         transition[4 + i, 4 + i] = kept[i]
     before = np.empty(STATES)
@@ -104,7 +166,7 @@ def move_bank(
         covariance[axis + 2, axis] += 0.5 * grown * duration_s
         covariance[axis + 2, axis + 2] += grown
     for i in range(3):
-        covariance[4 + i, 4 + i] += renewed[i]
+        covariance[4 + i, 4 + i] += (1.0 - kept[i] * kept[i]) * stationary[i]
 
 
 @entry("boolean(float64[:, ::1], float64[:, ::1], float64[::1], int64, float64, float64, float64, float64[::1])")

@@ -10,19 +10,15 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.compiled import entry
+from estimators.compiled import kernel
 from estimators.dekf_ci import add_corrections
 from estimators.linear_algebra import cholesky_solve, factor_upper, inverse_from_cholesky
-from estimators.measurements import ROW, Matrix, RowTable, Vector
+from estimators.measurements import Matrix, RowTable, Vector
 from estimators.motion import predict_information, predict_state
 from estimators.row_kernels import IntArray
 
 
-@entry(
-    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64,"
-    " float64[:, ::1], float64[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
-    ROW=ROW,
-)
+@kernel
 def filter_along(
     rows: RowTable,
     start: IntArray,
@@ -34,13 +30,13 @@ def filter_along(
     information: Matrix,
     vector: Vector,
     next_information: Matrix,
-    next_vector: Vector,
+    next_mean: Vector,
     covariance: Matrix,
 ) -> bool:
     """Run the information filter through a window, every tick linearised at the smoothed ``path``.
 
     ``path`` ``(N+1, 6n)``; ``information``, ``vector`` are the prior pair at the window's start.
-    ``next_information``, ``next_vector`` get the pair one tick later, before that tick's rows;
+    ``next_information``, ``next_mean`` get information and mean one tick later, before that tick's rows;
     ``covariance`` ``(6n, 6n)`` that of the last state. False where a pair is not positive definite.
     """
     n = vector.shape[0]
@@ -67,5 +63,5 @@ def filter_along(
                 pair[i] += info[i, j] * mean[j]
         if k == 0:
             next_information[:, :] = info
-            next_vector[:] = pair
+            next_mean[:] = mean
     return True

@@ -15,7 +15,6 @@ import numpy as np
 
 from estimators.dekf_ci import DistributedEkf
 from estimators.estimator import Payload, symmetrised
-from estimators.inputs import InputHistory
 from estimators.layout import STATES_PER_AGENT, Layout, block
 from estimators.measurements import Matrix, RowTable, Vector
 from estimators.motion import input_matrix, transition_matrix
@@ -231,12 +230,7 @@ def _transplant_window(
         new._last_heard[new.layout.slot(agent)] = old._last_heard[old_slot]
     known = {slot: s for slot, s in enumerate(sources) if s is not None}
     known |= {new.layout.slot(agent): old_slot for agent, old_slot in replaced.items()}
-    _transplant_inputs(old._inputs, new._inputs, known)
-
-
-def _transplant_inputs(old: InputHistory, new: InputHistory, slots: Mapping[int, int]) -> None:
-    for slot, old_slot in slots.items():
-        new._known[slot] = dict(old._known[old_slot])
+    new._inputs.take_over(old._inputs, known)
 
 
 def _renamed(rows: RowTable, sources: Sequence[int | None], old_size: int) -> RowTable:

@@ -64,6 +64,17 @@ def transpose_predict(adjoint: Vector, dt: float) -> None:
 
 
 @kernel
+def transpose_predict_all(adjoints: Matrix, dt: float) -> None:
+    """adjoints <- A' adjoints, in place, for ``(6n, m)``."""
+    m = adjoints.shape[1]
+    for s in range(adjoints.shape[0] // STATES_PER_AGENT):
+        p = STATES_PER_AGENT * s
+        for i in range(3):
+            for j in range(m):
+                adjoints[p + 3 + i, j] += dt * adjoints[p + i, j]
+
+
+@kernel
 def predict_covariance(cov: Matrix, accel_variance: Vector, dt: float) -> None:
     """cov <- A cov A' + B Q B', in place; eqs (17) and (20). ``accel_variance`` ``(3n,)`` is diag Q."""
     n = cov.shape[0]

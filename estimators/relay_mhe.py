@@ -17,22 +17,17 @@ import numpy as np
 
 from estimators.data_information import DataInformation
 from estimators.estimator import Estimate, Payload, SolverReport, Status, symmetrised
-from estimators.information import usable_pairs
-from estimators.inheritance import inherit
+from estimators.inheritance import inherit, survey
 from estimators.layout import Layout, block
-from estimators.marginalization import filter_along
-from estimators.measurements import Kind, Matrix, Vector
+from estimators.measurements import ROW, Matrix, Vector
 from estimators.motion import input_matrix, transition_matrix
 from estimators.moving_horizon import MovingHorizonEstimator
-from estimators.second_order import linearisation_variance
+from estimators.row_kernels import POSITION, any_of
+from estimators.second_order import filter_reweighted
 from estimators.settings import EstimatorSettings
 from estimators.window_types import WindowProblem, WindowSolution
 from estimators.witness import Body, Opinion, Witness, body_of, own_rows
 
-SIGNIFICANT = 0.05
-"""Share of a row's variance below which what its linearisation misses is left out."""
-REWEIGHTINGS = 3
-"""How often the covariance and what the linearisation misses at it are computed from each other."""
 RESEATED_SPREAD = 2.0
 """Factor on the covariance of a place taken over from the witness: the window's rows are in it already."""
 
@@ -64,13 +59,12 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
 
     def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         """Inherit from each neighbour's pair what it knows better. Pairs of another window start are not used."""
-        usable, refused = usable_pairs(received, self.window.first, self.layout.dimension)
-        self.refused_pairs += refused
-        if self.window.last == self.window.first:
+        timely = {slot: pair for slot, pair in received.items() if pair.tick == self.window.first}
+        usable, better = survey(self._pair[0], timely, self.slot)
+        self.refused_pairs += len(timely) - len(usable)
+        if not better or self.window.last == self.window.first:
             return
-        # the best informed first, whatever its place: the result does not depend on the agents' order
-        for slot in sorted(usable, key=lambda each: -np.linalg.slogdet(usable[each].information)[1]):
-            pair = usable[slot]
+        for slot, pair in usable.items():
             mixed = inherit(self._pair, (pair.information, pair.vector), self.slot)
             if mixed is not self._pair:
                 self.window.hear(slot, self.window.first)
@@ -78,52 +72,43 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
 
     def _slide(self, problem: WindowProblem, solution: WindowSolution) -> None:
         """Marginalise the oldest tick where the window is full; keep the covariance of the newest."""
-        information, vector = self._filter(problem, solution.path)
+        information, mean = self._filter(problem, solution.path)
         full = self.window.last - self.window.first == self.settings.window
         self._observable = self._data.advance(problem, solution.path, self.settings.norm_smoothing_m, slide=full)
         self._path = list(solution.path)
         if not full:  # the start stays
-            information, vector = problem.information, problem.vector
-        self.prior_information = np.ascontiguousarray(information)
-        self.prior_mean = np.asarray(np.linalg.solve(information, vector), np.float64)
+            information = np.ascontiguousarray(problem.information)
+            mean = np.asarray(np.linalg.solve(information, problem.vector), np.float64)
+        self.prior_information, self.prior_mean = information, mean
 
     def _filter(self, problem: WindowProblem, path: Matrix) -> tuple[Matrix, Vector]:
-        """The pair one tick after the window's start; sets the covariance at its end.
+        """Information and mean one tick after the window's start; sets the covariance at its end.
 
-        What the rows' linearisation misses follows from the covariance and it from that: iterated from the rows as
-        they are, so that a place that the data tell is not doubted for the prior's sake. The rows of ``problem`` get
-        the variances found.
+        The rows of ``problem`` get variances that hold what their linearisation misses.
         """
         n = len(problem.vector)
-        information, vector, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
-        path = np.ascontiguousarray(path)
-        measured = problem.rows
-        at = path[np.repeat(np.arange(len(path)), np.diff(problem.start))]
-        for _ in range(REWEIGHTINGS + 1):
-            sound = filter_along(
-                problem.rows,
-                problem.start,
-                problem.accel,
-                problem.accel_variance,
-                path,
-                self.period_s,
-                self.settings.norm_smoothing_m,
-                problem.information,
-                problem.vector,
-                information,
-                vector,
-                covariance,
-            )
-            if not sound:
-                raise ArithmeticError("the window's information is not positive definite")
-            missed = linearisation_variance(measured, at, covariance, self.settings.norm_smoothing_m)
-            total = measured["variance"] + np.where(missed > SIGNIFICANT * measured["variance"], missed, 0.0)
-            if np.allclose(total, problem.rows["variance"], rtol=SIGNIFICANT, atol=0.0):
-                break
-            problem.rows = measured.copy()
-            problem.rows["variance"] = total
+        information, mean, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
+        rows = np.empty(len(problem.rows), ROW)
+        sound = filter_reweighted(
+            problem.rows,
+            problem.start,
+            problem.accel,
+            problem.accel_variance,
+            np.ascontiguousarray(path),
+            self.period_s,
+            self.settings.norm_smoothing_m,
+            problem.information,
+            problem.vector,
+            rows,
+            information,
+            mean,
+            covariance,
+        )
+        if not sound:
+            raise ArithmeticError("the window's information is not positive definite")
+        problem.rows = rows
         self._covariance = symmetrised(covariance)
-        return information, vector
+        return information, mean
 
     def _estimate(self, problem: WindowProblem, mean: Vector, status: Status, report: SolverReport) -> Estimate:
         """The smoothed newest state with the covariance of the filter along the window."""
@@ -144,12 +129,14 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
 
     def _second_opinion(self, problem: WindowProblem, mean: Vector) -> Opinion | None:
         """Let the witness see the newest tick, and ask it about the estimate."""
+        before, self._own = self._own, body_of(mean, self._covariance, self.slot)
+        if any_of(problem.rows, POSITION, self.slot):
+            self._witness.rest()
+            return None
         mine = slice(3 * self.slot, 3 * self.slot + 3)
         rows, start = self.window.rows()
         newest = own_rows(rows[start[-2] :], self.slot)
-        fixed = bool(((rows["kind"] == Kind.POSITION) & (rows["agent"] == self.slot)).any())
-        self._witness.advance(newest, problem.accel[-1, mine], problem.accel_variance[-1, mine], fixed, self._own)
-        self._own = body_of(mean, self._covariance, self.slot)
+        self._witness.advance(newest, problem.accel[-1, mine], problem.accel_variance[-1, mine], False, before)
         located = np.flatnonzero(self._observable)
         bodies = {int(s): body_of(mean, self._covariance, int(s)) for s in located if s != self.slot}
         self._witness.see(newest, bodies)

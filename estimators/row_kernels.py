@@ -46,6 +46,15 @@ def mark_usable(rows: RowTable, agents: int, usable: NDArray[np.bool_]) -> None:
         usable[r] = finite and row["variance"] > 0.0 and row["half_width"] > 0.0 and known and paired
 
 
+@entry("boolean(ROW[::1], int64, int64)", ROW=ROW)
+def any_of(rows: RowTable, kind: int, agent: int) -> bool:
+    """Whether a row of a kind measures an agent."""
+    found = False
+    for r in range(rows.shape[0]):
+        found = found or (rows[r]["kind"] == kind and rows[r]["agent"] == agent)
+    return found
+
+
 @kernel
 def encode_rows(rows: RowTable, local: IntArray, code: IntArray, data: Matrix) -> None:
     """Fill ``code`` and ``data`` from the row table; ``local[slot]`` is the slot in the reduced problem."""

@@ -18,58 +18,102 @@ import numpy as np
 
 from estimators.compiled import entry, kernel
 from estimators.layout import STATES_PER_AGENT
+from estimators.marginalization import filter_along
 from estimators.measurements import ROW, Kind, Matrix, RowTable, Vector
+from estimators.row_kernels import IntArray
 
+SIGNIFICANT = 0.05
+"""Share of a row's variance below which what its linearisation misses is left out."""
+REWEIGHTINGS = 3
+"""How often the covariance and what the linearisation misses at it are computed from each other."""
 _RANGE, _ANCHOR_RANGE = int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
 
 
-def linearisation_variance(rows: RowTable, states: Matrix, covariance: Matrix, eps: float) -> Vector:
-    """Mean square ``(m,)`` in m2 of what each row's linearisation misses; zero for rows that are no ranges.
+@entry(
+    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64,"
+    " float64[:, ::1], float64[::1], ROW[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
+    ROW=ROW,
+)
+def filter_reweighted(
+    rows: RowTable,
+    start: IntArray,
+    accel: Matrix,
+    accel_variance: Matrix,
+    path: Matrix,
+    dt: float,
+    eps: float,
+    information: Matrix,
+    vector: Vector,
+    weighted: RowTable,
+    next_information: Matrix,
+    next_mean: Vector,
+    covariance: Matrix,
+) -> bool:
+    """`filter_along`, with rows whose variances hold what their linearisation misses where it is significant.
 
-    ``states`` ``(m, 6n)``: where each row is linearised; ``covariance`` ``(6n, 6n)`` of the fleet state; ``eps`` as
-    in the rows' smoothed norm, m.
+    That follows from the covariance and it from that: iterated from the rows as they are, so that a place that the
+    data tell is not doubted for the prior's sake. ``weighted`` ``(m,)`` gets the rows with the variances found.
     """
-    missed = np.zeros(len(rows))
-    _fill_second_moments(
-        np.ascontiguousarray(rows), np.ascontiguousarray(states), np.ascontiguousarray(covariance), eps, missed
-    )
-    return missed
+    for r in range(rows.shape[0]):
+        weighted[r] = rows[r]
+    total = np.empty(rows.shape[0])
+    for _ in range(REWEIGHTINGS + 1):
+        if not filter_along(
+            weighted, start, accel, accel_variance, path, dt, eps,
+            information, vector, next_information, next_mean, covariance,
+        ):  # fmt: skip
+            return False
+        settled = True
+        for k in range(start.shape[0] - 1):
+            for r in range(start[k], start[k + 1]):
+                measured = rows[r]["variance"]
+                missed = linearisation_variance(rows[r], path[k], covariance, eps)
+                total[r] = measured + missed if missed > SIGNIFICANT * measured else measured
+                before = weighted[r]["variance"]
+                settled = settled and abs(total[r] - before) <= SIGNIFICANT * before
+        if settled:
+            break
+        for r in range(rows.shape[0]):
+            weighted[r]["variance"] = total[r]
+    return True
 
 
-@entry("void(ROW[::1], float64[:, ::1], float64[:, ::1], float64, float64[::1])", ROW=ROW)
-def _fill_second_moments(rows: RowTable, states: Matrix, covariance: Matrix, eps: float, missed: Vector) -> None:
-    """1/2 tr(TDTD) + 1/4 tr(TD)^2 of the rows that are ranges."""
+@kernel
+def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps: float) -> float:
+    """Mean square in m2 of what a row's linearisation misses, 1/2 tr(TDTD) + 1/4 tr(TD)^2; zero but for ranges.
+
+    ``state`` ``(6n,)``: where the row is linearised; ``covariance`` ``(6n, 6n)`` of the fleet state; ``eps`` as in
+    the rows' smoothed norm, m.
+    """
+    if row["kind"] != _RANGE and row["kind"] != _ANCHOR_RANGE:
+        return 0.0
     away = np.empty(3)
     spread = np.empty((3, 3))
     bent = np.empty((3, 3))
-    for m in range(rows.shape[0]):
-        row = rows[m]
-        if row["kind"] != _RANGE and row["kind"] != _ANCHOR_RANGE:
-            continue
-        a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
-        b = STATES_PER_AGENT * row["other"]  # negative for anchors
-        anchor = (row["x"], row["y"], row["z"])
-        for i in range(3):
-            there = states[m, b + i] + o * states[m, b + 3 + i] if b >= 0 else anchor[i]
-            away[i] = states[m, a + i] + o * states[m, a + 3 + i] - there
-            for j in range(3):
-                middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
-                ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
-                spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
-        distance = np.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + eps * eps)
-        for i in range(3):
-            for j in range(3):
-                bent[i, j] = 0.0
-                for k in range(3):
-                    identity = 1.0 if i == k else 0.0
-                    curvature = (identity - away[i] / distance * (away[k] / distance)) / distance
-                    bent[i, j] += curvature * spread[k, j]
-        squares, trace = 0.0, 0.0
-        for i in range(3):
-            trace += bent[i, i]
-            for j in range(3):
-                squares += bent[i, j] * bent[j, i]
-        missed[m] = 0.5 * squares + 0.25 * trace * trace
+    a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
+    b = STATES_PER_AGENT * row["other"]  # negative for anchors
+    anchor = (row["x"], row["y"], row["z"])
+    for i in range(3):
+        there = state[b + i] + o * state[b + 3 + i] if b >= 0 else anchor[i]
+        away[i] = state[a + i] + o * state[a + 3 + i] - there
+        for j in range(3):
+            middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
+            ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
+            spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
+    distance = np.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + eps * eps)
+    for i in range(3):
+        for j in range(3):
+            bent[i, j] = 0.0
+            for k in range(3):
+                identity = 1.0 if i == k else 0.0
+                curvature = (identity - away[i] / distance * (away[k] / distance)) / distance
+                bent[i, j] += curvature * spread[k, j]
+    squares, trace = 0.0, 0.0
+    for i in range(3):
+        trace += bent[i, i]
+        for j in range(3):
+            squares += bent[i, j] * bent[j, i]
+    return float(0.5 * squares + 0.25 * trace * trace)
 
 
 @kernel

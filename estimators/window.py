@@ -10,7 +10,6 @@ from estimators.compiled import entry, kernel
 from estimators.inputs import InputHistory
 from estimators.layout import Layout
 from estimators.measurements import (
-    INPUT,
     ROW,
     InputTable,
     Kind,
@@ -71,20 +70,20 @@ class MeasurementWindow:
             self._origin = tick
         self.first = max(self.first, tick - self.ticks)
         if len(self._rows) and self._rows["tick"][0] < self.first:
-            self._rows = self._rows[self._rows["tick"] >= self.first]
+            self._rows = self._rows[np.searchsorted(self._rows["tick"], self.first) :]
         self._inputs.forget_before(self.first)
 
     def insert(self, rows: RowTable, inputs: InputTable) -> None:
         """Put rows and inputs to their places."""
-        self._insert_inputs(inputs)
+        refused, dropped = self._inputs.insert(inputs, self.first)
+        self.refused += refused
+        self.dropped += dropped
         if not len(rows):
             return
-        table = np.empty(len(self._rows) + len(rows), ROW)  # numpy's concatenation promotes every field, slowly
-        table[: len(self._rows)] = self._rows
+        table = np.empty(len(self._rows) + len(rows), ROW)
         new = np.ascontiguousarray(rows, ROW)
-        count, refused, dropped = _take_in(
-            table, len(self._rows), new, self.layout.size, self.first, self._last_heard
-        )
+        agents = len(self._last_heard)
+        count, refused, dropped = _take_in(table, self._rows, new, agents, self.first, self._last_heard)
         self._rows = table[:count]
         self.refused += refused
         self.dropped += dropped
@@ -95,24 +94,14 @@ class MeasurementWindow:
         self.dropped += int(np.count_nonzero(late))
         self.insert(rows[~late], inputs)
 
-    def _insert_inputs(self, inputs: InputTable) -> None:
-        for sample in np.asarray(inputs, INPUT):
-            tick, slot = int(sample["tick"]), int(sample["agent"])
-            finite = np.isfinite(sample["accel"]).all() and np.isfinite(sample["variance"]).all()
-            if not finite or (sample["variance"] <= 0).any() or not 0 <= slot < self.layout.size:
-                self.refused += 1
-            elif tick < self.first:
-                self.dropped += 1
-            else:
-                self._inputs.insert(tick, slot, sample["accel"], sample["variance"])
-
     def rows(self) -> tuple[RowTable, IntArray]:
         """Rows up to the window's last tick, sorted, and the first row of each tick ``(N+2,)``."""
         rows = self._rows
         if self._shared:
             rows = rows[~_seen_from_other_end(rows)]
-        start = np.searchsorted(rows["tick"], np.arange(self.first, self.last + 2))
-        return rows[: start[-1]], start.astype(np.int64)
+        start = np.empty(self.last - self.first + 2, np.int64)
+        _find_starts(rows, self.first, start)
+        return rows[: start[-1]], start
 
     def inputs(self) -> tuple[Matrix, Matrix]:
         """Accelerations ``(N, 3n)`` over the window's ticks and their variances, see `InputHistory`."""
@@ -128,18 +117,20 @@ class MeasurementWindow:
         return np.asarray(self.last - np.maximum(self._last_heard, before))
 
 
-@entry("UniTuple(int64, 3)(ROW[::1], int64, ROW[::1], int64, int64, int64[::1])", ROW=ROW)
+@entry("UniTuple(int64, 3)(ROW[::1], ROW[::1], ROW[::1], int64, int64, int64[::1])", ROW=ROW)
 def _take_in(
-    table: RowTable, count: int, rows: RowTable, agents: int, first: int, last_heard: IntArray
+    table: RowTable, known: RowTable, rows: RowTable, agents: int, first: int, last_heard: IntArray
 ) -> tuple[int, int, int]:
-    """Insert rows into the ``count`` sorted ones at the beginning of ``table``, of equal ones the earliest.
+    """``table`` <- what is ``known``, sorted, and ``rows``, of equal ones the earliest.
 
-    Gives the new count, how many rows no estimator could use, and how many were of ticks before ``first``.
+    Gives the number of them, how many rows no estimator could use, and how many were of ticks before ``first``.
     ``last_heard`` gets the latest tick of each observer.
     """
     usable = np.empty(rows.shape[0], np.bool_)
     mark_usable(rows, agents, usable)
-    refused, dropped = 0, 0
+    count, refused, dropped = known.shape[0], 0, 0
+    for i in range(count):  # numpy copies structured arrays field by field
+        table[i] = known[i]
     for r in range(rows.shape[0]):
         row = rows[r]
         if not usable[r]:
@@ -159,6 +150,16 @@ def _take_in(
         table[at] = row
         count += 1
     return count, refused, dropped
+
+
+@entry("void(ROW[::1], int64, int64[::1])", ROW=ROW)
+def _find_starts(rows: RowTable, first: int, start: IntArray) -> None:
+    """start ``(N+2,)`` <- the first of the sorted rows that is of each tick from ``first`` on, or of a later one."""
+    r = 0
+    for k in range(start.shape[0]):
+        while r < rows.shape[0] and rows[r]["tick"] < first + k:
+            r += 1
+        start[k] = r
 
 
 @kernel

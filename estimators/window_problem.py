@@ -18,7 +18,7 @@ import numpy as np
 from estimators.compiled import kernel
 from estimators.linear_algebra import LIBRARY_SIZE, add_outer_upper, multiply
 from estimators.measurements import Matrix, Vector
-from estimators.motion import predict_sensitivity, predict_state, transpose_predict
+from estimators.motion import predict_sensitivity, predict_state, transpose_predict, transpose_predict_all
 from estimators.row_kernels import (
     PRECISION,
     VALUE,
@@ -238,6 +238,46 @@ def hessian(window: Window, path: Trajectory, exact: bool, out: Matrix, sensitiv
                 chain_gradient(code, data, r, path.units[r], sens, scaled[r - first])
                 scaled[r - first] *= np.sqrt(data[r, PRECISION])
             out += np.dot(np.ascontiguousarray(scaled.T), scaled)
+
+
+@kernel
+def correction_hessian(window: Window, path: Trajectory, exact: bool, out: Matrix) -> None:
+    """Upper triangle of `hessian` for a window with corrections and without gains, by the adjoint recursion.
+
+    Then x_k depends on the variables through A and B alone. With H_k the curvature of tick k's rows and
+    M_k = H_k + A' M_{k+1} A, the blocks beside the prior's are M_0 for the start, (A^k)' M_k B for the start and the
+    correction that acts until tick k, and B' (A^{k-i})' M_k B for those until ticks i <= k.
+    """
+    code, data, start, dt = window.code, window.data, window.start, window.dt
+    d = window.prior_information.shape[0]
+    inputs = d // 2
+    ahead = np.zeros((d, d))  # M_k
+    pushed = np.empty((d, inputs))  # (A^{k-i})' M_k B
+    for k in range(start.shape[0] - 2, -1, -1):
+        for r in range(start[k], start[k + 1]):
+            second = -path.weights[r] if exact else 0.0
+            add_curvature(code, data, r, path.units[r], data[r, PRECISION], second, ahead)
+        if k == 0:
+            break
+        for i in range(d):
+            for j in range(inputs):
+                p = 6 * (j // 3) + j % 3
+                pushed[i, j] = 0.5 * dt * dt * ahead[i, p] + dt * ahead[i, p + 3]
+        column = d + (k - 1) * inputs
+        for i in range(k, 0, -1):
+            for a in range(inputs):
+                p, q = 6 * (a // 3) + a % 3, d + (i - 1) * inputs + a
+                for j in range(inputs):
+                    out[q, column + j] = 0.5 * dt * dt * pushed[p, j] + dt * pushed[p + 3, j]
+            transpose_predict_all(pushed, dt)
+        out[:d, column : column + inputs] = pushed
+        for i in range(inputs):
+            out[column + i, column + i] += window.noise_precision[k - 1, i]
+        transpose_predict_all(ahead, dt)
+        transpose_predict_all(ahead.T, dt)
+    for i in range(d):
+        for j in range(i, d):
+            out[i, j] = window.prior_information[i, j] + ahead[i, j]
 
 
 @kernel

@@ -99,8 +99,11 @@ class Witness:
         ``accel`` ``(3,)``: over the tick that ends now, m/s2. ``fixed``: whether the estimator's window holds a fix
         of this drone. ``estimate``: the own state at the last tick, from which a drone that loses its fixes goes on.
         """
+        if fixed:
+            self.rest()
+            return
         self._tick += 1
-        self._blind_ticks = 0 if fixed else self._blind_ticks + 1
+        self._blind_ticks += 1
         if self._blind_ticks < BLIND_TICKS:
             self.mixture = None
             return
@@ -112,6 +115,12 @@ class Witness:
             predict(mixture, accel, accel_variance, self._period_s)
             for row in linear[np.argsort(linear["value"], kind="stable")]:
                 correct_linear(mixture, _slope(row), float(row["value"]), float(row["variance"]))
+
+    def rest(self) -> None:
+        """Move to the next tick while the window holds a fix: there is nothing to doubt."""
+        self._tick += 1
+        self._blind_ticks = 0
+        self.mixture = None
 
     def see(self, rows: RowTable, bodies: Mapping[int, Body]) -> None:
         """Use the ranges of a tick, nearest first, to the bodies that are located (by slot) and to anchors."""

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.data_information import (
     OBSERVABLE_SIGMA_M,
-    observable_agents,
+    mark_observable,
 )
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
@@ -78,4 +78,6 @@ def test_the_worst_direction_decides_whatever_its_name() -> None:
     turn = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
     covariance = np.eye(12)
     covariance[:3, :3] = turn @ np.diag([0.1, 0.1, (1.1 * OBSERVABLE_SIGMA_M) ** 2]) @ turn.T
-    assert observable_agents(covariance).tolist() == [False, True]
+    observable = np.zeros(2, np.bool_)
+    mark_observable(covariance, observable)
+    assert observable.tolist() == [False, True]

@@ -16,10 +16,12 @@ from numpy.typing import NDArray
 
 from estimators.constrained_kernels import evaluate, linearise_bounds, prepare
 from estimators.dekf_ci import predict_and_correct
+from estimators.gauss_newton import set_weights
 from estimators.measurements import Kind, empty_rows
 from estimators.motion import input_matrix, predict_mean, transition_matrix
 from estimators.observability import observability_matrix, row_jacobian
 from estimators.window_kernels import CORRECTED, PREDICTED
+from estimators.window_problem import Window, correction_hessian, empty_trajectory, gradient, hessian, roll_out
 from estimators.window_solver import pre_estimation
 from estimators.window_types import WindowProblem
 from tests.support import builders
@@ -144,6 +146,24 @@ def test_window_gradient_and_hessians(kinds: tuple[Kind, ...], with_gains: bool)
     np.testing.assert_allclose(slope, dense_slope, rtol=0, atol=1e-11 * scale)
     np.testing.assert_allclose(kernels.plain(z, exact=False)[1], normal, rtol=0, atol=1e-11 * scale)
     np.testing.assert_allclose(sens, np.concatenate(reference.sensitivities(z)), rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize("exact", [False, True], ids=["Gauss-Newton", "exact"])
+def test_without_gains_the_adjoint_recursion_gives_the_hessian(exact: bool) -> None:
+    # GIVEN a window of input corrections at a point
+    problem, z = window_at_a_point(2, builders.ALL_KINDS, with_gains=False)
+    window = Window(*Kernels(problem, EPS).window)
+    path, slope = empty_trajectory(window), np.empty(len(z))
+    roll_out(window, z, path)
+    set_weights(window, path)
+    gradient(window, z, path, slope)
+    # WHEN its Hessian is computed through sensitivities and by the adjoint recursion
+    expected, found = np.empty((len(z), len(z))), np.empty((len(z), len(z)))
+    hessian(window, path, exact, expected, np.empty((path.states.size, len(z))))
+    correction_hessian(window, path, exact, found)
+    # THEN they are the same
+    scale = np.abs(np.triu(expected)).max()
+    np.testing.assert_allclose(np.triu(found), np.triu(expected), rtol=0, atol=1e-13 * scale)
 
 
 def test_hessian_of_coincident_agents_at_rest() -> None:

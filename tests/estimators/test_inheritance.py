@@ -7,7 +7,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimators.inheritance import inherit
+from estimators.estimator import Payload
+from estimators.inheritance import inherit, survey
 from estimators.layout import block
 
 AGENTS = 3
@@ -89,3 +90,21 @@ def test_the_own_block_is_never_taken() -> None:
     rng = np.random.default_rng(9)
     own, other = random_pair(rng, (5.0, 0.1, 0.1)), random_pair(rng, (0.1, 1.0, 1.0))
     assert inherit(own, other, slot=0) is own
+
+
+def test_a_survey_tells_which_pairs_can_be_fused_and_whether_one_knows_better() -> None:
+    # GIVEN neighbours of which one knows the third agent better, one the own place only, and two are unusable
+    rng = np.random.default_rng(4)
+    own = random_pair(rng, (0.5, 0.5, 5.0))
+    third, mine = random_pair(rng, (1.0, 1.0, 0.5)), random_pair(rng, (0.01, 1.0, 6.0))
+    pairs = {1: third, 2: mine, 3: (-third[0], third[1]), 4: (third[0], np.full(18, np.nan))}
+    received = {slot: Payload(7, *pair, rank=0) for slot, pair in pairs.items()}
+    # WHEN they are surveyed
+    usable, better = survey(own[0], received, slot=0)
+    # THEN the best informed of those that are sound comes first
+    log_dets = {slot: np.linalg.slogdet(pairs[slot][0])[1] for slot in (1, 2)}
+    assert list(usable) == sorted(log_dets, key=lambda slot: -log_dets[slot])
+    assert better
+    # and what is known of the own place does not count
+    assert survey(own[0], {2: received[2]}, slot=0) == ({2: received[2]}, False)
+    assert survey(own[0], {}, slot=0) == ({}, False)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from estimators.inputs import HISTORY_TICKS, InputHistory
+from estimators.measurements import input_rows
 from estimators.settings import EstimatorSettings, fade_per_tick
 
 OTHER = 4.0 / 3.0
@@ -16,7 +17,7 @@ def history(hold: bool, accels: dict[int, float], slot: int = 1) -> InputHistory
     """A history of two agents; ``accels`` by tick, the same on all axes, of one of them."""
     made = InputHistory(2, OTHER, hold=hold)
     for tick, value in accels.items():
-        made.insert(tick, slot, np.full(3, value), NOISE)
+        made.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)
     return made
 
 
@@ -44,7 +45,7 @@ def test_a_held_input_fades_and_its_variance_is_that_of_the_fading_guess() -> No
     fading, staying = InputHistory(1, OTHER, hold=True, fade=0.5), InputHistory(1, OTHER, hold=True)
     for tick, value in halving.items():
         for made in (fading, staying):
-            made.insert(tick, 0, np.full(3, value), NOISE)
+            made.insert(input_rows(tick, 0, np.full(3, value), NOISE), 0)
     accel, variance = fading.table(4, 8)
     # THEN the first is right, and as sure as its sensor
     assert accel[:, 0] == pytest.approx([0.5**tick for tick in range(4, 8)])
@@ -89,7 +90,7 @@ def test_the_order_of_arrival_does_not_matter(seed: int) -> None:
 
 def test_the_first_of_two_inputs_for_one_tick_counts() -> None:
     made = history(False, {3: 1.0})
-    made.insert(3, 1, np.full(3, 9.0), NOISE)
+    made.insert(input_rows(3, 1, np.full(3, 9.0), NOISE), 0)
     assert made.table(3, 4)[0][0, 3] == 1.0
 
 
@@ -98,3 +99,17 @@ def test_memory_is_bounded() -> None:
     made.forget_before(500)
     assert made.table(490 - HISTORY_TICKS, 491 - HISTORY_TICKS)[0][0, 3] == 0.0  # gone
     assert made.table(499, 500)[0][0, 3] == 1.0
+
+
+def test_a_history_takes_over_what_another_knows_of_the_same_agents() -> None:
+    # GIVEN a history of two agents, and one of three in which the second of them is the first
+    old, new = history(True, {4: 0.5, 5: 0.6}, slot=1), InputHistory(3, OTHER, hold=True)
+    old.insert(input_rows(5, 0, np.full(3, 0.1), NOISE), 0)
+    new.take_over(old, {2: 0, 0: 1})
+    # THEN it knows the same of them, and goes on
+    for tick, slot, value in ((5, 2, 9.0), (4, 1, 0.7)):
+        new.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)
+    accel, _ = new.table(4, 6)
+    assert accel[:, ::3].tolist() == [[0.5, 0.7, 0.0], [0.6, 0.0, 0.1]]
+    # and the other one is as it was
+    assert old.table(5, 6)[0][0, ::3].tolist() == [0.1, 0.6]

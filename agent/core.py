@@ -17,6 +17,7 @@ The estimate is of the tick's start k T, from all measurements nearer to it than
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from enum import Enum, auto
 
@@ -24,7 +25,7 @@ import numpy as np
 
 from agent.config_tables import FleetConfig
 from agent.frames import gravity_mps2
-from agent.health import Facts, HealthMonitor
+from agent.health import Facts, HealthMonitor, gps_lost
 from agent.latency import GpsLatency
 from agent.neighbours import NeighbourTable
 from agent.outputs import EstimateReady, HealthChanged, Output, Send, estimate_message
@@ -83,6 +84,8 @@ class AgentCore:
         self._last_fix_s: float | None = None
         self._tick: int | None = None
         self._phase = _Phase.END
+        self._end_s = self._close_s = self._packets_by_s = -math.inf
+        """When the tick ends, is closed, and goes on without packets that are missing; set with the tick."""
         self._round = 0
 
     # --- what comes in -------------------------------------------------------------------------------------
@@ -152,9 +155,8 @@ class AgentCore:
         self.records.neighbourhood.hear(sender, self._tick)
         if message.tick < self._tick or (message.tick == self._tick and self._phase is _Phase.ROUND):
             self.counters["measurements: late"] += 1
-        for record in message.records:
-            if self.records.add_heard(record, self._tick):
-                self.fleet.note(record, self._tick)
+        for record in self.records.add_heard(message.records, self._tick):
+            self.fleet.note(record, self._tick)
 
     def _on_information(self, sender: int, message: Information, now_s: float) -> None:
         outcome = self._barrier.put(sender, message.tick, message.round, message)
@@ -172,7 +174,7 @@ class AgentCore:
         if self._tick is None:
             return None
         if self._phase is _Phase.END:
-            return self._end_s + self._config.transport.guard_s
+            return self._close_s
         return self._packets_by_s if self._phase is _Phase.PACKETS else self._barrier.deadline_s
 
     def advance(self, now_s: float) -> list[Output]:
@@ -182,15 +184,28 @@ class AgentCore:
             self._enter(tick_of(now_s, self._period_s))
         if now_s > self._end_s + MAX_BEHIND_TICKS * self._period_s:
             self._leave_out_ticks(now_s)
-        while self._step(now_s, outputs):
+        while self._survived_step(now_s, outputs):
             pass
         return outputs
+
+    def _survived_step(self, now_s: float, outputs: list[Output]) -> bool:
+        """The next step of the tick if it is due. Whatever fails in it costs this tick's estimate, not the flight."""
+        tick = self._tick
+        try:
+            return self._step(now_s, outputs)
+        except Exception as fault:  # noqa: BLE001 - counted and kept in `last_fault`, from where the daemon says it
+            try:
+                self._finish(self._after_fault(fault), now_s, outputs)
+            finally:
+                if self._tick == tick:  # never the same tick again, whatever happens
+                    self._end_tick()
+            return True
 
     def _step(self, now_s: float, outputs: list[Output]) -> bool:
         """The next step of the tick if it is due."""
         assert self._tick is not None
         if self._phase is _Phase.END:
-            if now_s < self._end_s + self._config.transport.guard_s:
+            if now_s < self._close_s:
                 return False
             self._close_tick(outputs)
         elif self._phase is _Phase.PACKETS:
@@ -206,6 +221,9 @@ class AgentCore:
     def _enter(self, tick: int) -> None:
         """Begin to wait for the end of a tick."""
         self._tick, self._phase = tick, _Phase.END
+        self._end_s = (tick + 1) * self._period_s
+        self._close_s = self._end_s + self._config.transport.guard_s
+        self._packets_by_s = self._end_s + self._config.transport.exchange_fraction * self._period_s
         self._barrier.advance(tick)
 
     def _close_tick(self, outputs: list[Output]) -> None:
@@ -218,12 +236,7 @@ class AgentCore:
 
     def _begin(self, now_s: float, outputs: list[Output]) -> None:
         assert self._tick is not None
-        try:
-            started = self.fleet.begin(self._tick, now_s, self.records)
-        except ESTIMATOR_FAULTS as fault:
-            self._finish(self._after_fault(fault), now_s, outputs)
-            return
-        if not started:
+        if not self.fleet.begin(self._tick, now_s, self.records):
             self._finish(self.fleet.nothing(self._tick), now_s, outputs)
             return
         self._round = 0
@@ -233,7 +246,7 @@ class AgentCore:
         assert self._tick is not None
         rounds = self._config.estimator.rounds
         if self._round >= rounds:
-            self._solve(now_s, outputs)
+            self._finish(self.fleet.solve(), now_s, outputs)
             return
         outputs.append(Send(self.fleet.outgoing(self._tick, self._round)))
         share_s = self._config.transport.rounds_fraction * self._period_s / rounds
@@ -242,37 +255,30 @@ class AgentCore:
         self._phase = _Phase.ROUND
 
     def _mix(self, now_s: float, outputs: list[Output]) -> None:
-        received = self._barrier.close()
-        try:
-            self.fleet.mix(self._round, received)
-        except ESTIMATOR_FAULTS as fault:
-            self._finish(self._after_fault(fault), now_s, outputs)
-            return
+        self.fleet.mix(self._round, self._barrier.close())
         self._round += 1
         self._open_round_or_solve(now_s, outputs)
-
-    def _solve(self, now_s: float, outputs: list[Output]) -> None:
-        try:
-            estimate = self.fleet.solve()
-        except ESTIMATOR_FAULTS as fault:
-            estimate = self._after_fault(fault)
-        self._finish(estimate, now_s, outputs)
 
     def _finish(self, estimate: Estimate, now_s: float, outputs: list[Output]) -> None:
         """Hand out an estimate of those who are present, and go on to the next tick."""
         assert self._tick is not None
-        t_s, end_s = self._tick * self._period_s, self._end_s
-        on_time = now_s <= end_s + self._period_s
+        on_time = now_s <= self._end_s + self._period_s
+        present = self.fleet.present
+        own = block(present.index(self._agent_id))
+        ready = EstimateReady(in_layout(estimate, present, self.layout), self._tick * self._period_s, now_s, on_time)
+        message = estimate_message(estimate, present, own)
+        changed = self.health.update(self._facts(estimate, own, now_s), now_s)
+        outputs += (ready, Send(message))  # nothing fails from here on: no tick has two estimates
+        if changed is not None:
+            outputs.append(HealthChanged(changed))
         self.counters["ticks"] += 1
         self.counters["ticks: late"] += not on_time
         self.counters[f"status: {estimate.status.name.lower()}"] += 1
-        present = self.fleet.present
-        own = block(present.index(self._agent_id))
-        outputs.append(EstimateReady(in_layout(estimate, present, self.layout), t_s, now_s, on_time))
-        outputs.append(Send(estimate_message(estimate, present, own)))
-        changed = self.health.update(self._facts(estimate, own, now_s), now_s)
-        if changed is not None:
-            outputs.append(HealthChanged(changed))
+        self._end_tick()
+
+    def _end_tick(self) -> None:
+        assert self._tick is not None
+        self._barrier.abandon()
         self._enter(self._tick + 1)
 
     # --- faults, gaps --------------------------------------------------------------------------------------
@@ -280,7 +286,7 @@ class AgentCore:
     def _after_fault(self, fault: Exception) -> Estimate:
         """What follows from the last good estimate, flagged; the estimator starts anew from that at the next tick."""
         assert self._tick is not None
-        self.counters["estimator faults"] += 1
+        self.counters["estimator faults" if isinstance(fault, ESTIMATOR_FAULTS) else "core faults"] += 1
         self.last_fault = fault
         return self.fleet.fall_back(self._tick)
 
@@ -289,30 +295,21 @@ class AgentCore:
         assert self._tick is not None
         tick = tick_of(now_s, self._period_s)
         self.counters["ticks: left out"] += tick - self._tick
-        if self._phase is _Phase.ROUND:
-            self._barrier.close()
+        self._barrier.abandon()
         self.fleet.forget()
         self._enter(tick)
 
     # --- common --------------------------------------------------------------------------------------------
 
-    @property
-    def _end_s(self) -> float:
-        assert self._tick is not None
-        return (self._tick + 1) * self._period_s
-
-    @property
-    def _packets_by_s(self) -> float:
-        return self._end_s + self._config.transport.exchange_fraction * self._period_s
-
     def _facts(self, estimate: Estimate, own: slice, now_s: float) -> Facts:
         assert self._tick is not None
         started = self.fleet.started
-        near, directions = self.fleet.roll.anchors(self._agent_id, self._tick)
+        gps_age_s = self.gps_age_s(now_s)
+        near, directions = self.fleet.roll.anchors(self._agent_id, self._tick) if gps_lost(gps_age_s) else (0, 0)
         return Facts(
             status=estimate.status if started else None,
             own_sigma_m=float(np.sqrt(estimate.covariance.diagonal()[own][:3].max())),
-            gps_age_s=self.gps_age_s(now_s),
+            gps_age_s=gps_age_s,
             imu_coverage=0.0 if self._input is None else self._input.coverage,
             silent_neighbours=self.neighbours.silent(now_s),
             autopilot=self.autopilot_state,

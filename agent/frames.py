@@ -121,15 +121,17 @@ def from_euler(roll_rad: float, pitch_rad: float, yaw_rad: float) -> Quaternion:
 
 def interpolated(first: Quaternion, second: Quaternion, share: float) -> Quaternion:
     """Between two attitudes on the shorter arc; ``share`` 0 = first, 1 = second, beyond it extrapolates."""
-    dot = sum(a * b for a, b in zip(first, second, strict=True))
+    w0, x0, y0, z0 = first
+    w1, x1, y1, z1 = second
+    dot = w0 * w1 + x0 * x1 + y0 * y1 + z0 * z1
     sign = -1.0 if dot < 0 else 1.0
     dot = min(abs(dot), 1.0)
     angle = math.acos(dot)
     if angle < 1e-6:  # the sines below would divide two roundings
-        weights = (1 - share, share * sign)
+        a, b = 1 - share, share * sign
     else:
         sine = math.sin(angle)
-        weights = (math.sin((1 - share) * angle) / sine, sign * math.sin(share * angle) / sine)
-    w, x, y, z = (weights[0] * a + weights[1] * b for a, b in zip(first, second, strict=True))
+        a, b = math.sin((1 - share) * angle) / sine, sign * math.sin(share * angle) / sine
+    w, x, y, z = a * w0 + b * w1, a * x0 + b * x1, a * y0 + b * y1, a * z0 + b * z1
     length = math.sqrt(w * w + x * x + y * y + z * z)
     return w / length, x / length, y / length, z / length

@@ -20,12 +20,12 @@ from agent.fix_tracks import FixTracks
 from agent.locating import RangeLocator
 from agent.motions import Motions
 from estimators.estimator import Estimate
-from estimators.layout import block
+from estimators.layout import STATES_PER_AGENT, block, position
 from estimators.measurements import Vector
 from estimators.membership import Prior, marginal_pair, silence_sigma_m
 from transport.estimate_body import MAX_AGE_TICKS
 from transport.information_body import Information
-from transport.measurement_body import RangeRecord, Record
+from transport.measurement_body import AccelerationRecord, RangeRecord, Record
 
 ATTEMPT_EVERY_TICKS = 3
 """Places by ranges are sought this often: an attempt takes some milliseconds."""
@@ -47,6 +47,11 @@ def is_absent(age_ticks: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
     return np.asarray(age_ticks >= MAX_AGE_TICKS)
 
 
+def _pair(one: int, other: int) -> tuple[int, int]:
+    """Two agents, in either order."""
+    return (one, other) if one < other else (other, one)
+
+
 class Roll:
     """The drones of the estimate and what is known of the others; ``members`` in the order of the configuration."""
 
@@ -58,7 +63,8 @@ class Roll:
         self._tracks = FixTracks(config, self._motions)
         self._locator = RangeLocator(config, self._motions)
         self._heard: dict[int, int] = {}
-        self._ranged: dict[frozenset[int], int] = {}
+        self._ranged: dict[tuple[int, int], int] = {}
+        """Tick of the last range, by the ids of its ends."""
         self._joined: dict[int, int] = {}
         self._held: dict[int, int] = {}
         """When the ranges to a drone that is silent itself last held it."""
@@ -71,7 +77,7 @@ class Roll:
     @property
     def located(self) -> tuple[int, ...]:
         """The members whose measurements can be used."""
-        return tuple(a for a in self.members if a != self._agent_id or self.own_located)
+        return self.members if self.own_located else tuple(a for a in self.members if a != self._agent_id)
 
     @property
     def ambiguous(self) -> bool:
@@ -82,14 +88,18 @@ class Roll:
 
     def note(self, record: Record, tick: int) -> None:
         """A record, own or heard."""
-        self._motions.note(record)
-        self._tracks.note(record)
-        self._locator.note(record)
         when = min(record.tick, tick)
-        self._heard[record.observer] = max(self._heard.get(record.observer, when), when)
-        if isinstance(record, RangeRecord):
-            pair = frozenset((record.observer, record.other))
-            self._ranged[pair] = max(self._ranged.get(pair, when), when)
+        if when > self._heard.get(record.observer, -math.inf):
+            self._heard[record.observer] = when
+        if isinstance(record, AccelerationRecord):
+            self._motions.note(record)
+        elif isinstance(record, RangeRecord):
+            self._locator.note(record)
+            pair = _pair(record.observer, record.other)
+            if when > self._ranged.get(pair, -math.inf):
+                self._ranged[pair] = when
+        else:
+            self._tracks.note(record)
 
     def note_pair(self, message: Information) -> None:
         """A neighbour's pair: what it knows well of drones that are not located here."""
@@ -109,14 +119,14 @@ class Roll:
 
     def note_estimate(self, estimate: Estimate) -> None:
         """The latest estimate of the members."""
-        self._sigma_m, known = {}, {}
+        variances = estimate.covariance.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3]
+        sigmas_m = np.sqrt(variances.max(axis=1)).tolist()
+        self._sigma_m, known, located = dict(zip(self.members, sigmas_m, strict=True)), {}, self.located
         for slot, agent in enumerate(self.members):
-            own = block(slot)
-            mean, covariance = estimate.mean[own], estimate.covariance[own, own]
-            self._sigma_m[agent] = float(np.sqrt(covariance.diagonal()[:3].max()))
+            mean, at = estimate.mean[block(slot)], position(slot)
             self._places[agent] = mean[:3]
-            if agent in self.located:
-                known[agent] = mean, covariance[:3, :3]
+            if agent in located:
+                known[agent] = mean, estimate.covariance[at, at]
         self._locator.note_places(estimate.tick, known)
         for agent in self.members:
             silent = estimate.tick - self._heard.get(agent, -math.inf) > RANGED_TICKS
@@ -181,7 +191,7 @@ class Roll:
             if other != agent
             and other in self._places
             and tick - self._heard.get(other, -math.inf) <= RANGED_TICKS
-            and tick - self._ranged.get(frozenset((agent, other)), -math.inf) <= RANGED_TICKS
+            and tick - self._ranged.get(_pair(agent, other), -math.inf) <= RANGED_TICKS
         ]
         if agent not in self._places or not near:
             return 0, 0

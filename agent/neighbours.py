@@ -53,7 +53,10 @@ class NeighbourTable:
 
     def all_measured(self, tick: int, now_s: float) -> bool:
         """Whether every neighbour that is heard has sent its measurements of a tick."""
-        return all(n.measured_tick >= tick for n in self._table.values() if self._is_recent(n.heard_s, now_s))
+        for neighbour in self._table.values():
+            if neighbour.measured_tick < tick and self._is_recent(neighbour.heard_s, now_s):
+                return False
+        return True
 
     def informing(self, now_s: float) -> frozenset[int]:
         """Neighbours whose information a round waits for."""

@@ -49,6 +49,6 @@ def estimate_message(estimate: Estimate, agents: tuple[int, ...], own: slice) ->
         agents=agents,
         mean=estimate.mean,
         variance=estimate.covariance.diagonal().copy(),
-        age_ticks=tuple(int(min(age, MAX_AGE_TICKS)) for age in estimate.age_ticks),
+        age_ticks=tuple(min(age, MAX_AGE_TICKS) for age in estimate.age_ticks.tolist()),
         own_covariance=estimate.covariance[own, own],
     )

@@ -4,20 +4,13 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Container, Sequence
-from typing import Any
-
-import numpy as np
+from collections.abc import Container, Iterable, Sequence
 
 from agent.config_tables import FleetConfig
-from agent.records import input_of, rows_of
-from estimators.layout import Layout
-from estimators.measurements import INPUT, ROW, InputTable, RowTable
+from agent.records import inputs_of, rows_of
+from estimators.measurements import InputTable, RowTable
 from transport.errors import EncodeError
 from transport.measurement_body import AccelerationRecord, Measurements, RangeRecord, Record, as_sent, identity
-
-_Entry = tuple[int, int, int, RowTable]
-"""Tick, slot of the agent, slot of the range's other end or -1, and the rows or the input of one record."""
 
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
@@ -33,8 +26,11 @@ class Neighbourhood:
     """
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
-        self._settings = config.estimator
-        self._size = len(config.ids)
+        settings, size = config.estimator, len(config.ids)
+        self._rows_from, self._rows_to = 1 + settings.relay_hops, settings.relay_hops
+        """Hops from which rows are used, and from which they are sent on; the same of inputs."""
+        self._inputs_from = {"none": 0, "neighbours": 1, "fleet": size}[settings.share_inputs]
+        self._inputs_to = {"none": -1, "neighbours": 0, "fleet": size}[settings.share_inputs]
         self._recent_ticks = math.ceil(config.transport.neighbour_timeout_s / config.fleet.period_s)
         self._heard: dict[int, int] = {}
         self._tick = 0
@@ -64,20 +60,14 @@ class Neighbourhood:
     def uses(self, record: Record) -> bool:
         """Whether this agent's estimator takes the record."""
         hops = self.hops(record.observer)
-        if hops is None:
-            return False
-        if isinstance(record, AccelerationRecord):
-            return hops <= {"none": 0, "neighbours": 1, "fleet": self._size}[self._settings.share_inputs]
-        return hops <= 1 + self._settings.relay_hops
+        limit = self._inputs_from if isinstance(record, AccelerationRecord) else self._rows_from
+        return hops is not None and hops <= limit
 
     def sends(self, record: Record) -> bool:
         """Whether this agent tells its neighbours: its own records, and others' that are relayed so far."""
         hops = self.hops(record.observer)
-        if hops is None:
-            return False
-        if isinstance(record, AccelerationRecord):
-            return hops <= {"none": -1, "neighbours": 0, "fleet": self._size}[self._settings.share_inputs]
-        return hops <= self._settings.relay_hops
+        limit = self._inputs_to if isinstance(record, AccelerationRecord) else self._rows_to
+        return hops is not None and hops <= limit
 
 
 class RecordStore:
@@ -85,16 +75,17 @@ class RecordStore:
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
         self._agent_id = agent_id
-        self._layout = Layout(config.ids)
         self._history_ticks = config.transport.history_ticks
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
-        self._seen: dict[int, set[object]] = {}
-        self._held: dict[int, dict[int, Record]] = {}
-        """The objects taken in, by tick and ``id``: where packets are handed over as objects, most come again."""
-        self._to_send: dict[int, list[Record]] = {}
-        self._rows: list[_Entry] = []
-        self._inputs: list[_Entry] = []
+        self._seen: dict[int, dict[object, Record]] = {}
+        """The records taken in, by tick and identity."""
+        self._known: set[int] = set()
+        """``id`` of these objects: where packets are handed over as objects, most come again."""
+        self._to_send: dict[int, tuple[list[Record], list[Record]]] = {}
+        """Own and relayed records by tick."""
+        self._rows: list[Record] = []
+        self._inputs: list[AccelerationRecord] = []
         self.refused: Counter[str] = Counter()
 
     def add_own(self, record: Record) -> Record | None:
@@ -106,8 +97,55 @@ class RecordStore:
             return None
         return rounded if self._add(rounded) else None
 
-    def add_heard(self, record: Record, tick: int) -> bool:
-        """Take in a record that a neighbour sent, while ``tick`` is the current one; false if refused."""
+    def add_heard(self, records: Iterable[Record], tick: int) -> list[Record]:
+        """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
+        fresh = [record for record in records if id(record) not in self._known]
+        return [record for record in fresh if self._wanted(record, tick) and self._add(record)]
+
+    def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
+        """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
+
+        Slots are those of ``members``. Rows wait for the agents that they name to be ``located`` members, inputs for
+        theirs to be a member, as long as an estimator's window could still use them.
+        """
+        slots = {agent: slot for slot, agent in enumerate(members)}
+        usable = {agent for agent in members if agent in located}
+        rows: list[Record] = []
+        inputs: list[AccelerationRecord] = []
+        later: list[Record] = []
+        for record in self._rows:
+            end = record.other if isinstance(record, RangeRecord) else record.observer
+            ready = record.tick <= tick and record.observer in usable and end in usable
+            (rows if ready else later).append(record)
+        later_inputs: list[AccelerationRecord] = []
+        for push in self._inputs:
+            (inputs if push.tick < tick and push.observer in slots else later_inputs).append(push)
+        self._rows, self._inputs = later, later_inputs
+        self.forget(tick)
+        return rows_of(rows, slots), inputs_of(inputs, slots)
+
+    def forget(self, tick: int) -> None:
+        """Let go what no window that ends at a tick or later could use."""
+        first = tick - self._hold_ticks
+        waiting = [record for record in self._rows if record.tick >= first]
+        if len(waiting) < len(self._rows):
+            self.refused["not located"] += len(self._rows) - len(waiting)
+        self._rows = waiting
+        self._inputs = [record for record in self._inputs if record.tick >= first]
+        for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
+            self._known.difference_update(map(id, self._seen.pop(old).values()))
+            self._to_send.pop(old, None)
+
+    def packet(self, tick: int) -> Measurements:
+        """What neighbours get at a tick: the records of the last ticks, our own before relayed ones."""
+        records: list[Record] = []
+        for of_tick in range(tick, tick - self._history_ticks, -1):
+            for part in self._to_send.get(of_tick, ()):
+                records += part
+        return Measurements(tick, tuple(records))
+
+    def _wanted(self, record: Record, tick: int) -> bool:
+        """Whether a record that a neighbour sent is one to take in, if it is new."""
         if record.observer == self._agent_id:
             return False  # our own words, relayed back
         if record.tick > tick + AHEAD_TICKS:
@@ -119,92 +157,20 @@ class RecordStore:
         if not self.neighbourhood.uses(record):
             self.refused["heard: not used"] += 1
             return False
-        return self._add(record)
-
-    def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
-        """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
-
-        Slots are those of ``members``. Rows wait for the agents that they name to be ``located``, inputs for theirs
-        to be a member, as long as an estimator's window could still use them.
-        """
-        slots = np.full(self._layout.size + 1, -1, np.int32)  # the last stays for "no other end"
-        usable = [False] * self._layout.size + [True]
-        for slot, agent in enumerate(members):
-            slots[self._layout.slot(agent)] = slot
-            usable[self._layout.slot(agent)] = agent in located
-        known = (slots >= 0).tolist()
-        rows, self._rows = _parted(self._rows, lambda at, a, b: at <= tick and usable[a] and usable[b])
-        inputs, self._inputs = _parted(self._inputs, lambda at, a, _: at < tick and known[a])
-        self.forget(tick)
-        joined, pushes = _joined(rows, ROW), _joined(inputs, INPUT)
-        for field in ("agent", "other", "observer"):
-            joined[field] = slots[joined[field]]
-        pushes["agent"] = slots[pushes["agent"]]
-        return joined, pushes
-
-    def forget(self, tick: int) -> None:
-        """Let go what no window that ends at a tick or later could use."""
-        first = tick - self._hold_ticks
-        late = sum(entry[0] < first for entry in self._rows)
-        if late:
-            self.refused["not located"] += late
-        self._rows = [entry for entry in self._rows if entry[0] >= first]
-        self._inputs = [entry for entry in self._inputs if entry[0] >= first]
-        for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
-            del self._seen[old]
-            self._held.pop(old, None)
-            self._to_send.pop(old, None)
-
-    def packet(self, tick: int) -> Measurements:
-        """What neighbours get at a tick: the records of the last ticks, our own before relayed ones."""
-        records: list[Record] = []
-        for of_tick in range(tick, tick - self._history_ticks, -1):
-            held = self._to_send.get(of_tick, [])
-            records += sorted(held, key=lambda record: record.observer != self._agent_id)
-        return Measurements(tick, tuple(records))
-
-    def _add(self, record: Record) -> bool:
-        held = self._held.get(record.tick)
-        if held is None:
-            held = self._held[record.tick] = {}
-            self._seen[record.tick] = set()
-        if id(record) in held:
-            return False
-        name, seen = identity(record), self._seen[record.tick]
-        if name in seen:
-            return False
-        seen.add(name)
-        held[id(record)] = record
-        if self.neighbourhood.sends(record):
-            self._to_send.setdefault(record.tick, []).append(record)
-        slot = self._layout.slot(record.observer)
-        if isinstance(record, AccelerationRecord):
-            self._inputs.append((record.tick, slot, -1, input_of(record, self._layout)))
-        else:
-            rows = rows_of(record, self._layout)
-            other = self._layout.slot(record.other) if isinstance(record, RangeRecord) else -1
-            if len(rows):
-                self._rows.append((record.tick, slot, other, rows))
         return True
 
-
-def _parted(entries: list[_Entry], wanted: Callable[[int, int, int], bool]) -> tuple[list[RowTable], list[_Entry]]:
-    """The tables that are wanted by their tick and the agents that they name, and the rest."""
-    taken, left = [], []
-    for entry in entries:
-        at, agent, other, table = entry
-        if wanted(at, agent, other):
-            taken.append(table)
+    def _add(self, record: Record) -> bool:
+        """Take in a record; false if it is there already."""
+        seen, name = self._seen.setdefault(record.tick, {}), identity(record)
+        if name in seen:
+            return False
+        seen[name] = record
+        self._known.add(id(record))
+        if self.neighbourhood.sends(record):
+            own, relayed = self._to_send.setdefault(record.tick, ([], []))
+            (own if record.observer == self._agent_id else relayed).append(record)
+        if isinstance(record, AccelerationRecord):
+            self._inputs.append(record)
         else:
-            left.append(entry)
-    return taken, left
-
-
-def _joined(tables: list[RowTable], dtype: np.dtype[Any]) -> RowTable:
-    """The tables one after the other; numpy's concatenation promotes every field anew, slowly."""
-    joined = np.empty(sum(map(len, tables)), dtype)
-    at = 0
-    for table in tables:
-        joined[at : at + len(table)] = table
-        at += len(table)
-    return joined
+            self._rows.append(record)
+        return True

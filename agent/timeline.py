@@ -83,7 +83,7 @@ class Timeline:
         covered_s, integral = self._integral(points, start_s, end_s)
         self._closed_until_s = end_s
         self._forget(start_s - KEEP_S)
-        inside = sum(start_s <= t < end_s for t, _ in points)
+        inside = len([t for t, _ in points if start_s <= t < end_s])
         if covered_s <= 0.0:
             spread = self._sensors.accel_gap_sigma_mps2**2 + self._sensors.accel_sigma_mps2**2
             return TickInput(tick, (0.0, 0.0, 0.0), (spread, spread, spread), 0.0, 0)
@@ -127,23 +127,25 @@ class Timeline:
 
     def _integral(
         self, points: list[tuple[float, Triple]], start_s: float, end_s: float
-    ) -> tuple[float, list[float]]:
+    ) -> tuple[float, Triple]:
         """Covered time in s and integral in m/s over a tick."""
         gap_s = self._sensors.imu_max_gap_s
-        covered_s, integral = 0.0, [0.0, 0.0, 0.0]
+        covered_s, north, east, down = 0.0, 0.0, 0.0, 0.0
         if not points:
-            return covered_s, integral
+            return covered_s, (north, east, down)
         # Before the first and after the last sample the nearest one holds, for as long as a gap may be.
         held = [(points[0][0] - gap_s, points[0][1]), *points, (points[-1][0] + gap_s, points[-1][1])]
         for (t0, a0), (t1, a1) in pairwise(held):
-            low, high = max(t0, start_s), min(t1, end_s)
+            low = t0 if t0 > start_s else start_s
+            high = t1 if t1 < end_s else end_s
             if high <= low or t1 - t0 > gap_s * (1 + TICK_ROUNDING):
                 continue
-            middle = ((low + high) / 2 - t0) / (t1 - t0)
-            covered_s += high - low
-            for axis in range(3):
-                integral[axis] += (high - low) * (a0[axis] + middle * (a1[axis] - a0[axis]))
-        return covered_s, integral
+            middle, part_s = ((low + high) / 2 - t0) / (t1 - t0), high - low
+            covered_s += part_s
+            north += part_s * (a0[0] + middle * (a1[0] - a0[0]))
+            east += part_s * (a0[1] + middle * (a1[1] - a0[1]))
+            down += part_s * (a0[2] + middle * (a1[2] - a0[2]))
+        return covered_s, (north, east, down)
 
     def _forget(self, before_s: float) -> None:
         del self._imu[: bisect_left(self._imu, before_s, key=_time_of)]
@@ -153,10 +155,13 @@ class Timeline:
 
 def _insert(samples: list[_Sample], sample: _Sample) -> bool:
     """Put a sample in its place; false if that instant is taken already. The oldest makes room."""
-    index = bisect_left(samples, sample.t_s, key=_time_of)
-    if index < len(samples) and samples[index].t_s == sample.t_s:
-        return False
-    samples.insert(index, sample)
+    if not samples or sample.t_s > samples[-1].t_s:  # as nearly all
+        samples.append(sample)
+    else:
+        index = bisect_left(samples, sample.t_s, key=_time_of)
+        if samples[index].t_s == sample.t_s:
+            return False
+        samples.insert(index, sample)
     if len(samples) > MAX_SAMPLES:
         del samples[0]
     return True

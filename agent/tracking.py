@@ -91,7 +91,9 @@ class FleetTracker:
         else:
             self._change(tick)
             rows, inputs = records.take(tick, self.roll.members, self.roll.usable(tick))
-            inputs = np.concatenate((inputs, self._unseen_manoeuvres(tick)))
+            unseen = self._unseen_manoeuvres(tick)
+            if len(unseen):
+                inputs = np.concatenate((inputs, unseen))
         assert self._estimator is not None
         self._estimator.begin(tick, rows, inputs)
         return True
@@ -232,14 +234,14 @@ class FleetTracker:
 
         They go to every other tick, for two, lest the estimator learn from them how steady an acceleration is.
         """
-        tables = [empty_inputs()]
+        tables = []
         settings = self._config.estimator
-        for slot, agent in enumerate(self.roll.members):
+        for slot, agent in enumerate(self.roll.members if tick % 2 == 0 else ()):
             silent = self.roll.silent_ticks(agent, tick)
-            if silent > settings.window and tick % 2 == 0:
+            if silent > settings.window:
                 variance = unseen_variance(silent, settings.other_accel_variance, self._period_s)
                 tables.append(input_rows(tick - 1, slot, np.zeros(3), 2.0 * variance))
-        return np.concatenate(tables)
+        return np.concatenate(tables) if tables else empty_inputs()
 
     def _carried(self, good: Estimate, tick: int) -> Prior:
         """An earlier estimate of the members, moved on to this tick at its velocities, less sure of it."""
@@ -250,13 +252,16 @@ class FleetTracker:
 
 def in_layout(estimate: Estimate, members: tuple[int, ...], layout: Layout) -> Estimate:
     """An estimate of some drones in the layout of the whole fleet, the absent ones as the module's text says."""
+    told = np.minimum(estimate.age_ticks, MAX_AGE_TICKS - 1)
+    if members == layout.agents:
+        return replace(estimate, age_ticks=told)
     at = states_of([layout.slot(agent) for agent in members])
     mean = np.zeros(layout.dimension)
     covariance = ABSENT_VARIANCE * np.eye(layout.dimension)
     ages = np.full(layout.size, MAX_AGE_TICKS)
     mean[at] = estimate.mean
     covariance[np.ix_(at, at)] = estimate.covariance
-    ages[[layout.slot(agent) for agent in members]] = np.minimum(estimate.age_ticks, MAX_AGE_TICKS - 1)
+    ages[[layout.slot(agent) for agent in members]] = told
     return replace(estimate, mean=mean, covariance=covariance, age_ticks=ages)
 
 

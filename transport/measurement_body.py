@@ -129,7 +129,7 @@ _KIND_OF = {
     AnchorRangeRecord: RecordKind.ANCHOR_RANGE,
     AccelerationRecord: RecordKind.ACCELERATION,
 }
-_LAYOUT = {
+_LAYOUT: dict[int, struct.Struct] = {
     RecordKind.POSITION: struct.Struct("<BHBf3f3e3e"),
     RecordKind.VELOCITY: struct.Struct("<BHBf3f3e3e"),
     RecordKind.SPEED: struct.Struct("<BHBffee"),
@@ -137,6 +137,8 @@ _LAYOUT = {
     RecordKind.ANCHOR_RANGE: struct.Struct("<BHBf3ffee"),
     RecordKind.ACCELERATION: struct.Struct("<BHB3f3e"),
 }
+_SINGLE, _SINGLES = struct.Struct("<f"), struct.Struct("<3f")
+_HALF, _HALF_BITS = struct.Struct("<e"), struct.Struct("<H")
 RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
 
 
@@ -177,8 +179,8 @@ def as_sent(record: Record) -> Record:
     encoded = _encode_record(record, record.tick)
     if encoded is None:
         return record
-    ids = {record.observer, record.other} if isinstance(record, RangeRecord) else {record.observer}
-    return decode_measurements(encoded, tick=record.tick, count=1, roster=ids).records[0]
+    ids = (record.observer, record.other) if isinstance(record, RangeRecord) else (record.observer,)
+    return _record_from(_LAYOUT[_KIND_OF[type(record)]].unpack(encoded), record.tick, ids)
 
 
 def encode_measurements(
@@ -209,9 +211,9 @@ def decode_measurements(body: bytes, *, tick: int, count: int, roster: Collectio
     at = 0
     for _ in range(count):
         try:
-            layout = _LAYOUT[RecordKind(body[at])]
+            layout = _LAYOUT[body[at]]
             fields = layout.unpack_from(body, at)
-        except (IndexError, ValueError, struct.error):
+        except (IndexError, KeyError, struct.error):
             raise Rejected(Reason.MALFORMED, f"record {len(records)} at byte {at} of {len(body)}") from None
         records.append(_record_from(fields, tick, roster))
         at += layout.size
@@ -224,21 +226,21 @@ def decode_measurements(body: bytes, *, tick: int, count: int, roster: Collectio
 
 
 def _single(value: float) -> float:
-    return float(struct.unpack("<f", struct.pack("<f", value))[0])
+    return float(_SINGLE.unpack(_SINGLE.pack(value))[0])
 
 
 def _singles(values: Triple) -> Triple:
-    return _single(values[0]), _single(values[1]), _single(values[2])
+    return _triple(_SINGLES.unpack(_SINGLES.pack(*values)))
 
 
 def _half_up(value: float) -> float:
     """The smallest float16 not below ``value`` >= 0; inf beyond its range."""
     if value > 65504.0:
         return math.inf
-    packed = struct.pack("<e", value)
-    rounded: float = struct.unpack("<e", packed)[0]
+    packed = _HALF.pack(value)
+    rounded: float = _HALF.unpack(packed)[0]
     if rounded < value:
-        rounded = struct.unpack("<e", struct.pack("<H", int.from_bytes(packed, "little") + 1))[0]
+        rounded = _HALF.unpack(_HALF_BITS.pack(_HALF_BITS.unpack(packed)[0] + 1))[0]
     return rounded
 
 
@@ -249,12 +251,15 @@ def _encode_record(record: Record, packet_tick: int) -> bytes | None:
         raise EncodeError(f"{record}: expected a tick from 0 to the packet's tick {packet_tick}")
     _check_ids(record)
     values, limit, variances, half_widths = _numbers(record)
-    if not all(-limit <= value <= limit for value in values):
-        raise EncodeError(f"{record}: values must be finite and at most {limit:g}")
-    if not all(0 < variance < math.inf for variance in variances):
-        raise EncodeError(f"{record}: variances must be finite and positive")
-    if not all(half_width > 0 for half_width in half_widths):
-        raise EncodeError(f"{record}: half widths must be positive (inf = no bound)")
+    for value in values:
+        if not -limit <= value <= limit:
+            raise EncodeError(f"{record}: values must be finite and at most {limit:g}")
+    for variance in variances:
+        if not 0 < variance < math.inf:
+            raise EncodeError(f"{record}: variances must be finite and positive")
+    for half_width in half_widths:
+        if not half_width > 0:
+            raise EncodeError(f"{record}: half widths must be positive (inf = no bound)")
     sigmas = [_half_up(math.sqrt(variance)) for variance in variances]
     if age > MAX_AGE_TICKS or math.inf in sigmas:
         return None
@@ -269,8 +274,10 @@ def _encode_record(record: Record, packet_tick: int) -> bytes | None:
 
 
 def _check_ids(record: Record) -> None:
-    ids = (record.observer, record.other) if isinstance(record, RangeRecord) else (record.observer,)
-    if not all(MIN_AGENT_ID <= agent_id <= MAX_AGENT_ID for agent_id in ids) or len(set(ids)) != len(ids):
+    good = MIN_AGENT_ID <= record.observer <= MAX_AGENT_ID
+    if isinstance(record, RangeRecord):
+        good = good and MIN_AGENT_ID <= record.other <= MAX_AGENT_ID and record.other != record.observer
+    if not good:
         raise EncodeError(f"{record}: expected distinct agent ids from {MIN_AGENT_ID} to {MAX_AGENT_ID}")
 
 
@@ -305,27 +312,27 @@ def _numbers(record: Record) -> tuple[_Floats, float, _Floats, _Floats]:
 
 
 def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection[int]) -> Record:
-    kind, observer, tick = RecordKind(int(fields[0])), int(fields[1]), packet_tick - int(fields[2])
+    kind, observer, tick = fields[0], int(fields[1]), packet_tick - int(fields[2])
     _known(observer, roster)
     if tick < 0:
         raise Rejected(Reason.OUT_OF_RANGE, f"record of tick {tick}")
-    if kind is RecordKind.ACCELERATION:
+    if kind == RecordKind.ACCELERATION:
         accel = _bounded(fields[3:6], MAX_ACCEL_MPS2, "acceleration")
         return AccelerationRecord(observer, tick, _triple(accel), _triple(_variances(fields[6:9])))
     offset = _bounded(fields[3:4], MAX_OFFSET_S, "offset")[0]
-    if kind is RecordKind.POSITION:
+    if kind == RecordKind.POSITION:
         position = _triple(_bounded(fields[4:7], MAX_POSITION_M, "position"))
         variance = _triple(_variances(fields[7:10]))
         return PositionRecord(observer, tick, position, variance, _triple(_widths(fields[10:13])), offset)
-    if kind is RecordKind.VELOCITY:
+    if kind == RecordKind.VELOCITY:
         velocity = _triple(_bounded(fields[4:7], MAX_SPEED_MPS, "velocity"))
         variance = _triple(_variances(fields[7:10]))
         return VelocityRecord(observer, tick, velocity, variance, _triple(_widths(fields[10:13])), offset)
     sigma, half_width = _variances(fields[-2:-1])[0], _widths(fields[-1:])[0]
-    if kind is RecordKind.SPEED:
+    if kind == RecordKind.SPEED:
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]
         return SpeedRecord(observer, tick, speed, sigma, half_width, offset)
-    if kind is RecordKind.RANGE:
+    if kind == RecordKind.RANGE:
         other = _known(int(fields[4]), roster)
         if other == observer:
             raise Rejected(Reason.OUT_OF_RANGE, f"range of agent {observer} to itself")
@@ -344,27 +351,27 @@ def _known(agent_id: int, roster: Collection[int]) -> int:
 
 def _bounded(values: _Floats, limit: float, what: str) -> _Floats:
     for value in values:
-        if not math.isfinite(value):
-            raise Rejected(Reason.NOT_FINITE, what)
-        if abs(value) > limit:
+        if not -limit <= value <= limit:
+            if not math.isfinite(value):
+                raise Rejected(Reason.NOT_FINITE, what)
             raise Rejected(Reason.OUT_OF_RANGE, f"{what} {value:g}, at most {limit:g}")
     return values
 
 
 def _variances(sigmas: _Floats) -> _Floats:
     for sigma in sigmas:
-        if not math.isfinite(sigma):
-            raise Rejected(Reason.NOT_FINITE, "sigma")
-        if sigma <= 0:
+        if not 0 < sigma < math.inf:
+            if not math.isfinite(sigma):
+                raise Rejected(Reason.NOT_FINITE, "sigma")
             raise Rejected(Reason.OUT_OF_RANGE, f"sigma {sigma:g}, expected positive")
-    return tuple(sigma * sigma for sigma in sigmas)
+    return tuple([sigma * sigma for sigma in sigmas])
 
 
 def _widths(half_widths: _Floats) -> _Floats:
     for half_width in half_widths:
-        if math.isnan(half_width):
-            raise Rejected(Reason.NOT_FINITE, "half width")
-        if half_width <= 0:
+        if not half_width > 0:
+            if math.isnan(half_width):
+                raise Rejected(Reason.NOT_FINITE, "half width")
             raise Rejected(Reason.OUT_OF_RANGE, f"half width {half_width:g}, expected positive")
     return half_widths
 

@@ -1,7 +1,7 @@
 """The barrier of one consensus round: it collects what neighbours send and always ends by its deadline.
 
 Sans-I/O: `open` a round, `put` what arrives, ask `done`, `close` it. Packets may come before their round is
-opened (clocks differ); those of rounds already closed are late: counted, not used.
+opened (clocks differ); those of rounds already closed are late, and not used.
 """
 
 from __future__ import annotations
@@ -36,35 +36,18 @@ class RoundBarrier(Generic[Item]):
         Rounds per tick; packets of higher rounds are wild.
     ticks_ahead : int
         How many ticks beyond the current one a packet may be; what more a member sends is not stored.
-    in_order : bool
-        Whether packets of one neighbour arrive in the order sent. Then a packet of a later round proves that
-        the one of this round is lost, and the round need not wait for it.
     """
 
-    def __init__(self, rounds: int, *, ticks_ahead: int = 2, in_order: bool = False) -> None:
+    def __init__(self, rounds: int, *, ticks_ahead: int = 2) -> None:
         self._rounds = rounds
         self._ticks_ahead = ticks_ahead
-        self._in_order = in_order
         self._box: dict[RoundKey, dict[int, Item]] = {}
-        self._newest: dict[int, RoundKey] = {}
         self._floor: RoundKey = (-1, -1)
         self._tick = 0
         self._current: RoundKey | None = None
         self._expected: frozenset[int] = frozenset()
         self._missing: set[int] = set()
         self._deadline_s = 0.0
-        self.late = 0
-        self.duplicates = 0
-        self.wild = 0
-        self.unused = 0
-        """Packets kept for a round that was then never opened, or did not expect their sender."""
-        self.missed: dict[int, int] = {}
-        """Rounds that were closed without a neighbour's packet, by neighbour."""
-
-    @property
-    def stored(self) -> int:
-        """Packets held for this and later rounds."""
-        return sum(len(items) for items in self._box.values())
 
     @property
     def deadline_s(self) -> float:
@@ -92,24 +75,18 @@ class RoundBarrier(Generic[Item]):
         self.advance(tick)
         self._current, self._deadline_s = key, deadline_s
         here = self._box.get(key, {})
-        self._missing = {sender for sender in expected if sender not in here and not self._lost(sender, key)}
+        self._missing = {sender for sender in expected if sender not in here}
         self._expected = frozenset(expected)
 
     def put(self, sender: int, tick: int, round_: int, item: Item) -> Outcome:
-        """Keep a packet for its round, or count why not."""
+        """Keep a packet for its round, or say why not."""
         key = (tick, round_)
         if tick > self._tick + self._ticks_ahead or not 0 <= round_ < self._rounds:
-            self.wild += 1
             return Outcome.WILD
-        self._newest[sender] = max(self._newest.get(sender, (-1, -1)), key)
-        if self._current is not None and self._lost(sender, self._current):
-            self._missing.discard(sender)
         if key <= self._floor:
-            self.late += 1
             return Outcome.LATE
         items = self._box.setdefault(key, {})
         if sender in items:
-            self.duplicates += 1
             return Outcome.DUPLICATE
         items[sender] = item
         if key == self._current:
@@ -136,19 +113,18 @@ class RoundBarrier(Generic[Item]):
         if self._current is None:
             raise ValueError("no round is open")
         items = self._box.get(self._current, {})
-        for sender in self._expected - items.keys():
-            self.missed[sender] = self.missed.get(sender, 0) + 1
         used = {sender: items[sender] for sender in sorted(items.keys() & self._expected)}
-        self.unused -= len(used)  # `_drop_to` counts all that it drops
         floor, self._current = self._current, None
         self._missing = set()
         self._drop_to(floor)
         return used
 
+    def abandon(self) -> None:
+        """End the round that is open, if one is; what came for it is not used."""
+        if self._current is not None:
+            self.close()
+
     def _drop_to(self, floor: RoundKey) -> None:
         self._floor = floor
         for key in [key for key in self._box if key <= floor]:
-            self.unused += len(self._box.pop(key))
-
-    def _lost(self, sender: int, key: RoundKey) -> bool:
-        return self._in_order and self._newest.get(sender, (-1, -1)) > key
+            del self._box[key]

@@ -2,97 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 import pytest
 
-from agent.config_tables import FleetConfig
 from agent.core import AgentCore
 from agent.outputs import EstimateReady, Send
-from agent.samples import GpsSample, ImuSample, RangeSample
-from estimators.estimator import Estimate, Payload, Status
+from agent.samples import ImuSample, RangeSample
+from estimators.estimator import Status
 from estimators.factory import make_estimator
-from estimators.layout import Layout
-from estimators.measurements import InputTable, Matrix, RowTable, Vector
-from estimators.settings import EstimatorSettings
-from transport.header import Kind
+from tests.support.notebook_estimator import MakeConfig, Notebook, fix, lone, received, tick_through
 from transport.information_body import Information
 from transport.measurement_body import Measurements, PositionRecord
-from transport.opening import Received
 from transport.sealing import Sealer
 
-MakeConfig = Callable[..., FleetConfig]
 Fleet = Any
 """The `VirtualFleet` of conftest.py."""
-
-
-class Notebook:
-    """An estimator that notes its calls and answers with its prior; ``fail`` says what goes wrong when."""
-
-    def __init__(
-        self,
-        settings: EstimatorSettings,
-        layout: Layout,
-        slot: int,
-        mean: Vector,
-        covariance: Matrix,
-        period_s: float,
-    ) -> None:
-        self.layout, self.rounds, self.dropped = layout, settings.rounds, 0
-        self.mean, self.covariance = mean, covariance
-        self.calls: list[tuple[Any, ...]] = []
-        self.tick = 0
-
-    fail: Callable[[str, int], None] = staticmethod(lambda call, tick: None)
-
-    def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
-        self.tick = tick
-        self.calls.append(("begin", tick, measurements, inputs))
-        self.fail("begin", tick)
-
-    def outgoing(self, round_: int) -> Payload:
-        return Payload(self.tick, np.linalg.inv(self.covariance), self.mean, 6)
-
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
-        self.calls.append(("mix", round_, tuple(received)))
-        self.mixed = dict(received)
-        self.fail("mix", self.tick)
-
-    def solve(self, budget: int | None = None) -> Estimate:
-        self.fail("solve", self.tick)
-        mean = np.full_like(self.mean, np.nan) if self.fail("nan", self.tick) else self.mean
-        ages = np.zeros(self.layout.size, np.int64)
-        return Estimate(self.tick, mean, self.covariance, Status.OK, ages)
-
-
-def received(sender: int, message: Any, now_s: float = 0.0) -> Received:
-    kind = Kind.MEAS if isinstance(message, Measurements) else Kind.INFO
-    return Received(sender, kind, 1, 0, now_s, message)
-
-
-def fix(t_s: float) -> GpsSample:
-    return GpsSample(t_s, (1.0, 2.0, 3.0), 0.3, 0.5, None, 1.0, 0.1, 3)
-
-
-def lone(make_config: MakeConfig, *overrides: str, count: int = 1) -> tuple[AgentCore, list[Notebook]]:
-    """A core with notebooks for estimators, in the order in which they were made."""
-    made: list[Notebook] = []
-
-    def factory(*arguments: Any) -> Notebook:
-        made.append(Notebook(*arguments))
-        return made[-1]
-
-    config = make_config(count, "initial.position_m=[0.0, 0.0, 0.0]", *overrides)
-    return AgentCore(config, 1, factory), made
-
-
-def tick_through(core: AgentCore, start_s: float, duration_s: float) -> list[Any]:
-    outputs = []
-    for step in range(round(duration_s / 0.01)):
-        outputs += core.advance(start_s + 0.01 * step)
-    return outputs
 
 
 # --- one core ----------------------------------------------------------------------------------------------
@@ -179,39 +105,6 @@ def test_a_short_stall_is_made_up_tick_by_tick_and_reported_late(make_config: Ma
     assert [r.on_time for r in ready] == [False] * 14 + [True]
     assert core.counters["ticks: late"] == 14
     assert len(made) == 1
-
-
-@pytest.mark.parametrize("call", ["begin", "mix", "solve"])
-def test_a_broken_estimator_falls_back_and_starts_anew(make_config: MakeConfig, call: str) -> None:
-    core, made = lone(make_config, count=2)
-
-    def fail(what: str, tick: int) -> None:
-        if (what, tick) == (call, 1003):
-            raise np.linalg.LinAlgError("singular")
-
-    core.advance(100.0)
-    tick_through(core, 100.0, 0.25)
-    made[0].fail = fail
-    made[0].mean[3] = 3.0
-    ready = [o for o in tick_through(core, 100.25, 0.5) if isinstance(o, EstimateReady)]
-    statuses = {r.estimate.tick: r.estimate.status for r in ready}
-    assert statuses[1003] is Status.FELL_BACK
-    assert all(status is Status.OK for tick, status in statuses.items() if tick != 1003)
-    assert len(made) == 2
-    fallen = next(r.estimate for r in ready if r.estimate.tick == 1003)
-    assert fallen.mean[:3] == pytest.approx([0.3, 0.0, 0.0])  # one tick further at 3 m/s
-    assert fallen.covariance[0, 0] == pytest.approx(made[0].covariance[0, 0] + 1.0)
-    assert core.counters["estimator faults"] == 1
-    assert isinstance(core.last_fault, np.linalg.LinAlgError)
-
-
-def test_an_estimate_that_is_not_finite_never_gets_out(make_config: MakeConfig) -> None:
-    core, made = lone(make_config)
-    tick_through(core, 100.0, 0.25)
-    made[0].fail = lambda what, tick: (what, tick) == ("nan", 1003)  # type: ignore[assignment,return-value]
-    ready = [o for o in tick_through(core, 100.25, 0.5) if isinstance(o, EstimateReady)]
-    assert all(np.isfinite(r.estimate.mean).all() for r in ready)
-    assert core.counters["estimator faults"] == 1
 
 
 def test_before_any_position_the_estimate_says_no_data(make_config: MakeConfig) -> None:

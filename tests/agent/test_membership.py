@@ -53,7 +53,7 @@ class Agent:
         if record.observer == 1:
             taken: Record | None = self.store.add_own(record)
         else:
-            taken = record if self.store.add_heard(record, self.tick) else None
+            taken = record if self.store.add_heard([record], self.tick) else None
         if taken is not None:
             self.tracker.note(taken, self.tick)
 
@@ -200,3 +200,8 @@ def test_the_layout_of_the_whole_fleet_says_who_is_absent() -> None:
     assert full.mean[6:12].tolist() == [0.0, 1.0, 2.0, 3.0, 4.0, 5.0]
     assert full.covariance.diagonal()[18:].tolist() == [7.0, 8.0, 9.0, 10.0, 11.0, 12.0]
     assert (full.covariance.diagonal()[:6] == ABSENT_VARIANCE).all()
+    # AND with all of them there nobody counts as absent, however long nothing was heard
+    whole = in_layout(estimate, (2, 4), Layout((2, 4)))
+    assert not is_absent(whole.age_ticks).any()
+    assert whole.mean.tolist() == estimate.mean.tolist()
+    assert whole.covariance.tolist() == estimate.covariance.tolist()

@@ -64,7 +64,7 @@ def replay(
     estimates as CSV and MCAP. Flight records of our own daemons are repeated exactly and compared instead.
     """
     from fleetloc.replay_exports import exporting
-    from fleetloc.replay_run import clear, run_replay
+    from fleetloc.replay_run import clear, refuse_inputs, run_replay
     from fleetloc.replay_setup import Options, prepare, split_truth
     from fleetloc.warmup import announce, warm_up_everything
 
@@ -86,6 +86,7 @@ def replay(
         refused = [name for name, value in given.items() if value is not None]
         _repeat(config, logs, refused, settings, folder, json_file)
         return
+    refuse_inputs(folder, (config, *logs, *truth, *(ranges_from or ())))
     prepared = prepare(
         Options(
             config=config,

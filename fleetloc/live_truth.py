@@ -56,11 +56,6 @@ class LiveTruth:
             return False
         return True
 
-    @property
-    def flown_s(self) -> float:
-        """Simulated time between the first and the last sample kept."""
-        return self._samples[-1].time_unix_s - self._samples[0].time_unix_s if self._samples else 0.0
-
     def error_m(self, slot: int, time_unix_s: float, position_m: tuple[float, float, float]) -> float | None:
         """Distance of a position from the truth at that time; ``None`` if the time is not covered."""
         for later, earlier in zip(reversed(self._samples), list(reversed(self._samples))[1:], strict=False):

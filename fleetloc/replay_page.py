@@ -9,7 +9,7 @@ from fleetloc import replay_plots
 from fleetloc.replay_figures import Results
 from fleetloc.replay_run import Replayed
 from fleetloc.replay_setup import Prepared
-from fleetloc.replay_tables import error_table, log_table
+from fleetloc.replay_tables import cautions, error_table, log_table
 from fleetloc.report_html import CSS
 from fleetloc.report_plots import colour, packets
 
@@ -114,11 +114,7 @@ def _warnings(figures: dict[str, Any]) -> str:
         f"GPS of drone {drop['agent']} was dropped on request from {drop['from_s']:.1f} to {drop['to_s']:.1f} s"
         for drop in figures["gps_dropped"]
     ]
-    for agent in figures["agents"]:
-        if agent["first_estimate_s"] is None:
-            sentences.append(f"drone {agent['id']} ({agent['log']}) never had an estimate: no fixes, or none in time")
-    if figures["fleet"]["silences_left_out"]:
-        sentences.append(f"{figures['fleet']['silences_left_out']} long silence(s) of the logs were left out")
+    sentences += cautions(figures)
     return "".join(f'<p class="warning">{escape(sentence)}</p>\n' for sentence in sentences)
 
 

@@ -6,13 +6,15 @@ import time
 from pathlib import Path
 from typing import Any
 
+import typer
+
 from fleetloc import run_files
 from fleetloc.output import print_table, write_json
 from fleetloc.replay_figures import load_results, report_figures
 from fleetloc.replay_page import drawn_sections, page
 from fleetloc.replay_run import Replayed
 from fleetloc.replay_setup import Prepared
-from fleetloc.replay_tables import error_table, log_table
+from fleetloc.replay_tables import cautions, error_table, log_table
 
 
 def write_report(
@@ -39,3 +41,5 @@ def _print(figures: dict[str, Any]) -> None:
     title = "SYNTHETIC RANGES, made of the truth" if figures["synthetic_ranges"] else None
     print_table(*log_table(figures), title="logs: samples used, content skipped")
     print_table(*error_table(figures), title=title)
+    for sentence in cautions(figures):
+        typer.echo(f"note: {sentence}")

@@ -15,7 +15,7 @@ import gc
 import re
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -46,6 +46,11 @@ LATENCY_EVERY_S = 1.0
 RARE_COLLECTIONS = (100_000, 50, 100)
 """Thresholds of the collector while samples stream through: they leave no cycles, and looking for some is a tenth."""
 _OF_A_REPLAY = re.compile(rf"agent_[0-9]{{3}}\.csv|({'|'.join(KINDS)})_[0-9]{{3}}\.track|{re.escape(MCAP)}")
+
+
+def refuse_inputs(directory: Path, inputs: Iterable[Path | str]) -> None:
+    """Refuse a folder in which `clear` would remove what the replay is to read; raises `InputError`."""
+    run_files.refuse_inputs(directory, inputs, also=_OF_A_REPLAY)
 
 
 def clear(directory: Path) -> None:

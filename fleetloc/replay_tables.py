@@ -6,6 +6,9 @@ from typing import Any
 
 from fleetloc.replay_figures import ALL, SETTLED
 
+MOSTLY = 0.9
+"""Share of the estimates with a truth below which a reader is told."""
+
 
 def log_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and rows: what was used and skipped of each vehicle's log."""
@@ -57,6 +60,21 @@ def error_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
                 ]
             )
     return columns, rows
+
+
+def cautions(figures: dict[str, Any]) -> list[str]:
+    """What a reader of the figures must know of them."""
+    sentences = []
+    for agent in figures["agents"]:
+        if agent["first_estimate_s"] is None:
+            sentences.append(f"drone {agent['id']} ({agent['log']}) never had an estimate: no fixes, or none in time")
+        estimated = agent["ticks_expected"] - agent["ticks_without_estimate"]
+        if 0 < agent["ticks_with_truth"] < MOSTLY * estimated:
+            known = f"{agent['ticks_with_truth']} of its {estimated} estimates"
+            sentences.append(f"errors of drone {agent['id']} are of {known}: there is no truth for the others")
+    if figures["fleet"]["silences_left_out"]:
+        sentences.append(f"{figures['fleet']['silences_left_out']} long silence(s) of the logs were left out")
+    return sentences
 
 
 def shown(value: float | None, digits: int = 3, factor: float = 1.0) -> str:

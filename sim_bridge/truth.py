@@ -64,10 +64,6 @@ class Truth:
         velocity = (6 * s**2 - 6 * s) * (p0 - p1) + (3 * s**2 - 4 * s + 1) * m0 + (3 * s**2 - 2 * s) * m1
         return np.concatenate((position, velocity / step), axis=-1)
 
-    def at_ticks(self, ticks: ArrayLike, period_s: float, epoch_unix_s: float = 0.0) -> Array:
-        """States ``(K, n, 6)`` at the beginnings of fleet ticks."""
-        return self.at(epoch_unix_s + period_s * np.asarray(ticks, float))
-
     def save(self, path: Path) -> None:
         """Write an ``.npz``; raises `OSError` if the file cannot be written."""
         with path.open("wb") as file:

@@ -32,6 +32,10 @@ _TYPES: dict[str, tuple[str, float | None]] = {
     "q": ("q", None), "Q": ("Q", None), "g": ("e", None),
 }  # fmt: skip
 """Characters of a format: how they are packed, and the factor to the unit (m, m/s, deg) where it is not 1."""
+_TEXTS, _INTEGERS = frozenset("anNZ"), frozenset("bBhHiIMqQ")
+_TEXT_LABEL = "Name"
+_INTEGER_LABELS = frozenset(("TimeUS", "I", "C", "PI", "Status", "GMS", "GWk", "SMS", "Type"))
+"""Wanted labels that are text, or whole numbers, in every layout; all others are numbers."""
 
 Values = dict[str, Any]
 """The wanted fields of a record by label, in the log's units (m, m/s, rad/s, deg); absent where it has none."""
@@ -144,7 +148,10 @@ class RecordReader:
         unpacker = struct.Struct("<" + "".join(packed for packed, _ in known))
         if unpacker.size + HEAD_BYTES != length:
             return None
+        # a flipped bit makes another type of the same size, such as four characters (n) of a float (f)
         taken = [(label, labels.index(label)) for label in self._wanted.get(name, ()) if label in labels]
+        if not all(_may_be(label, characters[place]) for label, place in taken):
+            return None
         return _Layout(
             name,
             length,
@@ -153,6 +160,13 @@ class RecordReader:
             tuple(map(itemgetter(1), taken)),
             tuple(known[place][1] for _, place in taken),
         )
+
+
+def _may_be(label: str, character: str) -> bool:
+    """Whether a wanted field can be of this type."""
+    if label == _TEXT_LABEL:
+        return character in _TEXTS
+    return character in _INTEGERS if label in _INTEGER_LABELS else character not in _TEXTS
 
 
 def _text(raw: bytes) -> str:

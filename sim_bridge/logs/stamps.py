@@ -7,8 +7,11 @@ really passed) from a clock that was set.
 
 from __future__ import annotations
 
+import math
+from bisect import bisect_left, bisect_right, insort
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator
+from itertools import islice
 from typing import TypeVar
 
 TOLERANCE_US = 3_000_000
@@ -55,6 +58,40 @@ def _judged(
         return item
     notes["stamps replaced"] += 1
     return restamped(item, median_us)
+
+
+LOOK_AHEAD = 1000
+"""Lines of a table; 20 s of the usual 50 Hz."""
+COSTLY_LINES = 2
+"""A stamp that would cost so many of those behind it is left out, which costs one."""
+
+
+def rising(stamped: Iterable[tuple[float, T]], skipped: Counter[str]) -> Iterator[tuple[float, T]]:
+    """The items of a table whose times in seconds rise; the others are left out and counted.
+
+    A single stamp from the future must not cost the rest of the table: one is left out if several of the next
+    `LOOK_AHEAD` lie between the last one taken and it. Unlike in `without_outliers` the pace of the stamps does not
+    matter, as a table may have one per second, or gaps.
+    """
+    source = iter(stamped)
+    held: deque[tuple[float, T]] = deque()
+    ordered: list[float] = []
+    last_s = -math.inf
+    while True:
+        for one in islice(source, LOOK_AHEAD + 1 - len(held)):
+            held.append(one)
+            insort(ordered, one[0])
+        if not held:
+            return
+        t_s, item = held.popleft()
+        del ordered[bisect_left(ordered, t_s)]
+        if t_s <= last_s:
+            skipped["time not rising"] += 1
+        elif bisect_left(ordered, t_s) - bisect_right(ordered, last_s) >= COSTLY_LINES:
+            skipped["time ahead of the lines behind it"] += 1
+        else:
+            last_s = t_s
+            yield t_s, item
 
 
 class StampRepair:

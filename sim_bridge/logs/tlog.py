@@ -111,6 +111,7 @@ class TlogSource:
         self._survey: LogSurvey | None = None
         self._sources: dict[int, Source] = {}
         self._clocks: dict[int, BootClock] = {}
+        self._clock_notes: Counter[str] = Counter()
         self.counts = LogCounts()
 
     @property
@@ -154,9 +155,7 @@ class TlogSource:
         finally:
             for vehicle in vehicles.values():
                 counts.skipped.update(vehicle.skipped)
-            for found in survey.systems.values():
-                if found.reboots:
-                    counts.notes["reboots"] += found.reboots
+            counts.notes.update(self._clock_notes)
 
     def _placed(self, counts: LogCounts, repair: StampRepair) -> Generator[Placed, None, None]:
         """The wanted messages with their log times; those with stamps that are not believed are left out."""
@@ -196,6 +195,7 @@ class TlogSource:
         self._clocks = {
             system_id: BootClock(heard[source].clock.sessions()) for system_id, source in self._sources.items()
         }
+        self._clock_notes = sum((_clock_notes(heard[source].clock) for source in self._sources.values()), Counter())
         systems = {system_id: _system(system_id, heard[source]) for system_id, source in self._sources.items()}
         return LogSurvey(_unix(repair), first_s, last_s, systems)
 
@@ -282,6 +282,17 @@ def _system(system_id: int, found: _Heard) -> SystemSurvey:
         first_fix=found.first_fix,
         estimate_frame=_estimate_frame(found),
         truth_from=next((name for name in TRUTHS if found.messages[name]), None),
+    )
+
+
+def _clock_notes(clock: BootClockFit) -> Counter[str]:
+    """What was dealt with in a vehicle's boot times."""
+    return Counter(
+        {
+            "reboots": clock.reboots,
+            "jumps of a boot clock": clock.jumps,
+            "boot times that fit no clock": clock.refused,
+        }
     )
 
 

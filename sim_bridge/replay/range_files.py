@@ -17,18 +17,18 @@ A line that cannot be used is counted by reason with the numbers of the first su
 from __future__ import annotations
 
 import csv
-import gzip
 import heapq
-import io
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.text_lines import text_lines
 from transport.errors import Rejected
 from transport.uwb_body import MAX_RANGE_M, UwbFrame, decode_uwb
 
@@ -41,12 +41,16 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "true_m": ("true_m", "mocap_range", "truth"),
 }
 REQUIRED = ("time", "observer", "target", "range_m")
+_EXPECTED = f"a header line with the columns {', '.join(REQUIRED)}, or JSON lines"
 UNIX_FROM_S = 1e9
 """Times from here on (2001) are Unix time."""
 REORDERED_LINES = 512
 """So many lines are held back to put them into the order of their times."""
 LINES_NAMED = 5
-MAX_LINE = 1 << 16
+
+
+Numbered = Generator[tuple[int, str], None, None]
+"""Lines of a file with their numbers."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,38 +113,23 @@ def in_order(lines: Iterable[tuple[int, RangeLine]], counts: RangeCounts) -> Ite
 
 
 def _lines(path: Path, counts: RangeCounts) -> Iterator[tuple[int, RangeLine]]:
-    with path.open("rb") as raw:
-        packed = raw.peek(2)[:2] == b"\x1f\x8b"
-        with gzip.open(raw) if packed else raw as unpacked:
-            text = io.TextIOWrapper(unpacked, encoding="utf-8", errors="replace", newline="")
-            try:
-                first = text.readline(MAX_LINE)
-                if first.lstrip().startswith("{"):
-                    yield from _json_lines(first, text, counts)
-                else:
-                    yield from _csv_lines(path, first, text, counts)
-            except (EOFError, gzip.BadGzipFile):
-                counts.skip("the file ends early", 0)
+    numbered = text_lines(path, counts.skip)
+    first = next(numbered, None)
+    if first is None:
+        raise ReplayError(path, f"ranges: {_EXPECTED}", "no line that can be read")
+    if first[1].lstrip().startswith("{"):
+        yield from _json_lines(first, numbered, counts)
+    else:
+        yield from _csv_lines(_columns(path, first[1]), numbered, counts)
 
 
-def _csv_lines(path: Path, first: str, rest: Iterable[str], counts: RangeCounts) -> Iterator[tuple[int, RangeLine]]:
-    columns = _columns(path, first)
-    number = 1
-    reader = csv.reader(rest)
-    while True:
-        number += 1
-        try:
-            cells = next(reader)
-        except StopIteration:
-            return
-        except csv.Error:
-            counts.skip("no CSV", number)
+def _csv_lines(columns: Mapping[str, int], rest: Numbered, counts: RangeCounts) -> Iterator[tuple[int, RangeLine]]:
+    for number, text in rest:
+        if text.startswith("#"):
             continue
-        if not cells or cells[0].startswith("#"):
-            continue
+        cells = next(csv.reader([text]))  # line by line: a stray quote costs its line only
         try:
-            values = {name: cells[index] for name, index in columns.items() if index < len(cells)}
-            line = _line(values)
+            line = _line({name: cells[index] for name, index in columns.items() if index < len(cells)})
         except (KeyError, ValueError) as error:
             counts.skip(_reason(error), number)
             continue
@@ -149,36 +138,29 @@ def _csv_lines(path: Path, first: str, rest: Iterable[str], counts: RangeCounts)
 
 def _columns(path: Path, header: str) -> dict[str, int]:
     """Where each known column is; raises `ReplayError` naming what is missing."""
-    found = [name.strip().lower() for name in next(csv.reader([header.lstrip("\ufeff")]), [])]
+    found = [name.strip().lower() for name in next(csv.reader([header]))]
     columns = {name: found.index(spelling) for name, spelling in _spellings(found)}
-    missing = [name for name in REQUIRED if name not in columns]
-    if missing:
-        seen = ", ".join(found)[:80] or "nothing"
-        raise ReplayError(path, f"ranges: a header line with the columns {', '.join(REQUIRED)}", f"{seen!r}")
+    if not set(REQUIRED) <= columns.keys():
+        raise ReplayError(path, f"ranges: {_EXPECTED}", repr(", ".join(found)[:80]))
     return columns
 
 
-def _json_lines(first: str, rest: Iterable[str], counts: RangeCounts) -> Iterator[tuple[int, RangeLine]]:
-    number = 0
-    for text in _chain(first, rest):
-        number += 1
-        if not text.strip():
-            continue
+def _json_lines(first: tuple[int, str], rest: Numbered, counts: RangeCounts) -> Iterator[tuple[int, RangeLine]]:
+    for number, text in chain([first], rest):
         try:
             content = json.loads(text)
+        except (ValueError, RecursionError):
+            counts.skip("no JSON", number)
+            continue
+        try:
             if not isinstance(content, dict):
                 raise ValueError("no object")
             lines = frame_lines(decode_uwb(text.encode())) if "obs" in content else [_line(_renamed(content))]
-        except (KeyError, ValueError, TypeError, Rejected, RecursionError) as error:
+        except (KeyError, ValueError, Rejected) as error:
             counts.skip(_reason(error), number)
             continue
         for line in lines:
             yield number, line
-
-
-def _chain(first: str, rest: Iterable[str]) -> Iterator[str]:
-    yield first
-    yield from rest
 
 
 def frame_lines(frame: UwbFrame) -> list[RangeLine]:
@@ -227,7 +209,7 @@ def _line(values: Mapping[str, Any]) -> RangeLine:
 def _number(values: Mapping[str, Any], name: str) -> float:
     try:
         value = float(values[name])
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise ValueError(f"{name} no number") from error
     if not math.isfinite(value):
         raise ValueError(f"{name} not finite")
@@ -244,8 +226,6 @@ def _id(values: Mapping[str, Any], name: str) -> int:
 def _reason(error: Exception) -> str:
     if isinstance(error, KeyError):
         return f"{error.args[0]} missing"
-    if isinstance(error, json.JSONDecodeError):
-        return "no JSON"
     if isinstance(error, Rejected):
         return f"frame: {error.reason}"
     return str(error)

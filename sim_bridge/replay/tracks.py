@@ -25,7 +25,7 @@ Floats = NDArray[np.float64]
 
 
 class TrackWriter:
-    """Appends states in the order of their times; those that are not later than the last are counted, not written."""
+    """Appends states in the order of their times; those that are not later than the last are left out."""
 
     def __init__(self, path: Path) -> None:
         """Make the file anew; raises `OSError` if that cannot be done."""
@@ -34,12 +34,10 @@ class TrackWriter:
         self._held = 0
         self._last_s = -math.inf
         self.written = 0
-        self.out_of_order = 0
 
     def write(self, t_s: float, position_m: Triple, velocity_mps: Triple | None) -> None:
         """One state, NED m and m/s at fleet time ``t_s``."""
         if not t_s > self._last_s:
-            self.out_of_order += 1
             return
         self._last_s = t_s
         self._buffer[self._held] = (t_s, position_m, UNKNOWN if velocity_mps is None else velocity_mps)

@@ -9,8 +9,6 @@ from __future__ import annotations
 
 import bisect
 import csv
-import gzip
-import io
 import itertools
 import math
 import re
@@ -22,11 +20,16 @@ from pathlib import Path
 from agent.frames import FleetFrame
 from agent.samples import Quaternion, Triple
 from sim_bridge.logs.events import TruthSample
+from sim_bridge.logs.stamps import rising
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.text_lines import text_lines
 
 POSITION, VELOCITY, QUATERNION = ("n", "e", "d"), ("vn", "ve", "vd"), ("qw", "qx", "qy", "qz")
 UNIX_NAMES, BOOT_NAME = ("unix_s", "time_unix_s"), "time_boot_s"
-_ORIGIN = re.compile(r"lat\s+(-?[\d.]+)\s+lon\s+(-?[\d.]+)\s+alt\s+(-?[\d.]+)")
+_ORIGIN = re.compile(r"lat\s+{0}\s+lon\s+{0}\s+alt\s+{0}".format(r"([-+.\d][-+.\deE]*)"))
+MAX_HEIGHT_M = 1e5
+MAX_NUMBER = 1e12
+"""No time, place or speed is as large."""
 PLACE_TOLERANCE_M = 1e-3
 MEDIAN_LINES = 101
 """Two seconds of the usual 50 Hz."""
@@ -62,15 +65,10 @@ class TruthFile:
         recorder's stamps jitter, the autopilot's do not.
         """
         self.skipped.clear()
-        last_s = -math.inf
-        for time_s, row in self._boot_timed() if clock == "boot" else self._unix_timed():
-            if time_s <= last_s:
-                self.skipped["time not rising"] += 1
-                continue
-            last_s = time_s
+        for time_s, row in rising(self._boot_timed() if clock == "boot" else self._unix_timed(), self.skipped):
             position, velocity = _triple(row, POSITION), _triple(row, VELOCITY)
             assert position is not None
-            yield TruthSample(time_s, self._moved(position), velocity, _quaternion(row))
+            yield TruthSample(time_s, position, velocity, _quaternion(row))
 
     def has_boot_clock(self) -> bool:
         """Whether the file gives the autopilot's own time."""
@@ -79,7 +77,7 @@ class TruthFile:
     def _boot_timed(self) -> Iterator[tuple[float, Row]]:
         for row in self._rows():
             if BOOT_NAME not in row:
-                raise ReplayError(self.path, f"truth: a column {BOOT_NAME}", f"{', '.join(row)}")
+                raise ReplayError(self.path, f"truth: a column {BOOT_NAME}", repr(", ".join(row)[:80]))
             yield row[BOOT_NAME], row
 
     def _unix_timed(self) -> Iterator[tuple[float, Row]]:
@@ -89,7 +87,7 @@ class TruthFile:
         for row in self._rows():
             unix_s = next((row[name] for name in UNIX_NAMES if name in row), None)
             if unix_s is None:
-                raise ReplayError(self.path, f"truth: a column {' or '.join(UNIX_NAMES)}", f"{', '.join(row)}")
+                raise ReplayError(self.path, f"truth: a column {' or '.join(UNIX_NAMES)}", repr(", ".join(row)[:80]))
             if BOOT_NAME not in row:
                 yield unix_s, row
                 continue
@@ -104,58 +102,58 @@ class TruthFile:
         for boot_s, row in held:
             yield boot_s + ordered[len(ordered) // 2], row
 
-    def _moved(self, position_m: Triple) -> Triple:
-        north, east, down = position_m
-        dn, de, dd = self._shift_m
-        return north + dn, east + de, down + dd
-
-    _shift_m: Triple = (0.0, 0.0, 0.0)
-
     def _rows(self) -> Iterator[Row]:
-        """The lines as numbers by name; those that are none are counted."""
-        with self.path.open("rb") as raw:
-            packed = raw.peek(2)[:2] == b"\x1f\x8b"
-            with gzip.open(raw) if packed else raw as unpacked:
-                text = io.TextIOWrapper(unpacked, encoding="utf-8", errors="replace", newline="")
-                try:
-                    yield from self._parsed(text)
-                except (EOFError, gzip.BadGzipFile):
-                    self.skipped["the file ends early"] += 1
-
-    def _parsed(self, text: io.TextIOWrapper) -> Iterator[Row]:
+        """The lines as numbers by name, places in the fleet's frame; those that are none are counted."""
         names: list[str] = []
-        for cells in csv.reader(text):
-            if not cells:
+        shift_m: Triple = (0.0, 0.0, 0.0)
+        for _, line in text_lines(self.path, self._skip):
+            if line.startswith("#"):
+                shift_m = self._origin(line) or shift_m
                 continue
-            if cells[0].startswith("#"):
-                self._take_origin(",".join(cells))
-            elif not names:
+            cells = next(csv.reader([line]))
+            if not names:
                 names = self._header(cells)
-            else:
-                try:
-                    row = dict(zip(names, map(float, cells), strict=True))
-                except ValueError:
-                    self.skipped["no numbers"] += 1
-                    continue
-                if all(map(math.isfinite, row.values())):
-                    yield row
-                else:
-                    self.skipped["not finite"] += 1
+                continue
+            try:
+                row = dict(zip(names, map(float, cells), strict=True))
+            except ValueError:
+                self.skipped["no numbers"] += 1
+                continue
+            if not all(abs(number) <= MAX_NUMBER for number in row.values()):
+                self.skipped["not finite or too large"] += 1
+                continue
+            for name, shift in zip(POSITION, shift_m, strict=True):
+                row[name] += shift
+            yield row
         if not names:
-            raise ReplayError(self.path, "truth: a header line with n, e, d", "an empty file")
+            raise ReplayError(self.path, "truth: a header line with n, e, d", "no line that can be read")
+
+    def _skip(self, reason: str, _line: int) -> None:
+        self.skipped[reason] += 1
 
     def _header(self, cells: list[str]) -> list[str]:
         names = [cell.strip() for cell in cells]
         if not set(POSITION) <= set(names):
-            raise ReplayError(self.path, "truth: a header line with n, e, d", repr(",".join(names))[:80])
+            raise ReplayError(self.path, "truth: a header line with n, e, d", repr(",".join(names)[:80]))
         return names
 
-    def _take_origin(self, comment: str) -> None:
+    def _origin(self, comment: str) -> Triple | None:
+        """Where the origin that a comment names is in the fleet's frame, NED m; ``None`` if it names none.
+
+        Raises `ReplayError` for an origin that is none: the states would be anywhere.
+        """
         match = _ORIGIN.search(comment)
-        if match:
-            lat, lon, alt = map(float, match.groups())
-            place = self.frame.ned(lat, lon, alt)
-            self._shift_m = place if max(map(abs, place)) > PLACE_TOLERANCE_M else (0.0, 0.0, 0.0)
+        if match is None:
+            return None
+        try:
+            lat_deg, lon_deg, alt_m = (float(word.rstrip(".")) for word in match.groups())
+        except ValueError:
+            lat_deg = lon_deg = alt_m = math.nan
+        if not (abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0 and abs(alt_m) <= MAX_HEIGHT_M):
+            expected = "truth: lat LAT lon LON alt ALT of its origin in degrees and metres"
+            raise ReplayError(self.path, expected, repr(match.group()[:80]))
+        place = self.frame.ned(lat_deg, lon_deg, alt_m)
+        return place if max(map(abs, place)) > PLACE_TOLERANCE_M else (0.0, 0.0, 0.0)
 
 
 def _triple(row: Row, names: tuple[str, str, str]) -> Triple | None:

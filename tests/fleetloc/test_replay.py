@@ -200,6 +200,33 @@ def test_what_cannot_be_done_is_refused_in_one_line(
     assert len(err.strip().splitlines()) == 1
 
 
+def test_errors_of_a_part_of_the_estimates_are_called_so(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # GIVEN a truth that ends in the middle of the flight
+    truth = tmp_path / "truth.csv"
+    lines = gzip.decompress((LOGS / "copter_truth.csv.gz").read_bytes()).decode().splitlines()
+    truth.write_text("\n".join(lines[: len(lines) // 2]) + "\n")
+    single = CONFIGS / "single.toml"
+    code, out, err = run(capsys, "replay", single, COPTER, "--truth", truth, "--out", tmp_path / "out")
+    assert code == 0, err
+    # THEN the terminal and the page say of how many estimates the errors are
+    assert "note: errors of drone 1 are of " in out
+    assert "there is no truth for the others" in (tmp_path / "out" / "report.html").read_text()
+    # and of the whole flight there is no such note
+    code, out, _ = run(capsys, "replay", single, COPTER, "--out", tmp_path / "out")
+    assert code == 0
+    assert "note:" not in out
+
+
+def test_a_replay_does_not_remove_what_it_is_to_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # GIVEN a log that is called as our own records are, in the folder of the results
+    log = tmp_path / "agent_001.tlog"
+    log.write_bytes(gzip.decompress(COPTER.read_bytes()))
+    code, _, err = run(capsys, "replay", CONFIGS / "single.toml", log, "--out", tmp_path)
+    assert code == 2
+    assert "agent_001.tlog" in err
+    assert log.exists()
+
+
 def test_files_of_truth_may_follow_the_option_one_after_the_other() -> None:
     logs = [Path("a.tlog"), Path("t2.csv.gz"), Path("b.tlog")]
     assert split_truth(logs, ["t1.csv"]) == ([Path("a.tlog"), Path("b.tlog")], ["t1.csv", "t2.csv.gz"])

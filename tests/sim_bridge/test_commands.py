@@ -10,10 +10,8 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim_bridge.flavours import px4_mode
 from sim_bridge.scenario import Interval, Vehicle
+from tests.support.hovering import ARDUPILOT, HOVER, PX4
 
-HOVER = {"start_m": (5.0, 0.0, 5.0), "start_velocity_mps": (0.0, 0.0, 0.0)}
-PX4 = Vehicle(1, "px4", 7, **HOVER)
-ARDUPILOT = Vehicle(1, "ardupilot", 7, **HOVER)
 ON_GROUND = {"start_m": (1.0, 2.0, 0.0), "on_ground": True}
 BOTH = pytest.mark.parametrize("flavour", ["px4", "ardupilot"])
 OK, DENIED, UNSUPPORTED = mavlink.MAV_RESULT_ACCEPTED, mavlink.MAV_RESULT_DENIED, mavlink.MAV_RESULT_UNSUPPORTED

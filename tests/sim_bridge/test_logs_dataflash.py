@@ -200,6 +200,41 @@ def test_a_damaged_description_is_counted_and_not_used() -> None:
     assert skipped["damaged FMT record"] == 1
 
 
+@pytest.mark.parametrize(
+    ("kind", "good", "flipped"),
+    [
+        ("IMU", b"QBffffff", b"QBfffnff"),
+        ("XKF1", b"QBffffff", b"QBfffnff"),
+        ("ATT", b"Qfff", b"Qfnf"),
+        ("GPS", b"QBBIHBcLLeff", b"QBBIHBcLLenf"),
+        ("GPS", b"QBBIHBcLLeff", b"QBBfHBcLLeff"),
+        ("PARM", b"QNf", b"QNn"),
+        ("PARM", b"QNf", b"dNf"),
+    ],
+)
+def test_a_type_that_a_field_cannot_have_is_a_damaged_description(
+    tmp_path: Path, kind: str, good: bytes, flipped: bytes
+) -> None:
+    """GIVEN a number described as text, or an integer as a float, of the same size THEN its records are left out."""
+    name = kind.encode().ljust(4, b"\0")
+    data = FLIGHT.replace(name + good.ljust(16, b"\0"), name + flipped.ljust(16, b"\0"), 1)
+    assert data != FLIGHT
+    path = tmp_path / "x.BIN"
+    assert attempt(path, data) > 200
+    source, _ = read(path)
+    assert source.counts.skipped["damaged FMT record"] == 1
+    assert kind not in next(iter(source.survey().systems.values())).messages
+
+
+@IN_ONE_FOLDER
+@given(st.data())
+def test_damaged_descriptions_never_break_the_reading(tmp_path: Path, data: st.DataObject) -> None:
+    damaged = bytearray(FLIGHT)
+    for place in data.draw(st.sets(st.integers(len(FMT_OF_FMT), len(HEADER) - 1), max_size=20)):
+        damaged[place] ^= 1 << data.draw(st.integers(0, 7))
+    attempt(tmp_path / "x", bytes(damaged))
+
+
 def attempt(path: Path, data: bytes) -> int:
     path.write_bytes(data)
     try:

@@ -148,6 +148,7 @@ class Run:
         self.closed = 0
         self.replay = Replay(config, Feed(inputs, self), make_estimator, self.on_estimate)
         self.counts: ReplayCounts = self.replay.run()
+        assert {member.core.last_fault for member in self.replay.members.values()} == {None}
 
     def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
         self.estimates.setdefault(agent_id, []).append(ready)

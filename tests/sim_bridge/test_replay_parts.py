@@ -59,7 +59,7 @@ def test_a_track_gives_back_a_cubic_between_its_samples_and_nothing_in_gaps(tmp_
     assert states[known, :3] == pytest.approx(at(wanted[known]), abs=1e-9)
     assert states[known, 3:] == pytest.approx(velocity(wanted[known]), abs=0.02)
     assert np.isnan(states[[3, 5]]).all()
-    assert (writer.written, writer.out_of_order) == (len(times), 1)
+    assert writer.written == len(times)
 
 
 def test_a_track_without_velocities_is_linear(tmp_path: Path) -> None:
@@ -296,7 +296,7 @@ def test_a_file_that_is_no_truth_is_refused(tmp_path: Path) -> None:
     with pytest.raises(ReplayError, match="expected truth: a header line with n, e, d"):
         list(TruthFile(path, FRAME).samples("boot"))
     path.write_text("")
-    with pytest.raises(ReplayError, match="an empty file"):
+    with pytest.raises(ReplayError, match="no line that can be read"):
         list(TruthFile(path, FRAME).samples("boot"))
     path.write_text("n,e,d,unix_s\n1,2,3,4\n")
     with pytest.raises(ReplayError, match="time_boot_s"):

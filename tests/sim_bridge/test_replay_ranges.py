@@ -96,10 +96,71 @@ def test_a_truncated_packed_file_gives_what_is_there(tmp_path: Path) -> None:
     assert counts.skipped["the file ends early"] == 1
 
 
-@given(st.binary(max_size=400))
-def test_any_bytes_end_in_sound_ranges(tmp_path_factory: pytest.TempPathFactory, content: bytes) -> None:
+def test_a_damaged_packed_file_gives_what_is_before_the_damage(tmp_path: Path) -> None:
+    # GIVEN a stream that cannot be unpacked from its middle on
+    rng = np.random.default_rng(1)
+    body = "".join(f"{k},1,2,{rng.uniform(1, 9):.6f},0.1\n" for k in range(20_000))
+    packed = gzip.compress((HEADER + body).encode())
+    middle = len(packed) // 2
+    path = tmp_path / "ranges.csv.gz"
+    path.write_bytes(packed[:middle] + b"\xff" * 64 + packed[middle + 64 :])
+    lines, counts = read(path)
+    assert 5000 < len(lines) < 15_000
+    assert counts.skipped["gzip stream damaged from some byte on"] == 1
+
+
+@pytest.mark.parametrize("beginning", [b"\n \r\n", b"\xef\xbb\xbf", b"\xef\xbb\xbf\n"])
+@pytest.mark.parametrize("table", [HEADER + "5,1,2,4.0,0.1\n", '{"time":5,"observer":1,"target":2,"range_m":4.0}'])
+def test_a_byte_order_mark_and_blank_lines_begin_a_table_too(tmp_path: Path, beginning: bytes, table: str) -> None:
+    path = tmp_path / "ranges"
+    path.write_bytes(beginning + table.encode())
+    lines, counts = read(path)
+    assert [(line.time_s, line.range_m) for line in lines] == [(5.0, 4.0)]
+    assert not counts.skipped
+
+
+@pytest.mark.parametrize(
+    ("line", "reason"),
+    [
+        ('{"time": 1, "observer": 1, "target": 2, "range_m": 1' + "0" * 400 + "}", "range_m no number"),
+        ('{"time": 1, "observer": 1, "target": 2, "range_m": ' + "9" * 5000 + "}", "no JSON"),
+        ('{"time": [1], "observer": 1, "target": 2, "range_m": 3}', "time no number"),
+        ("[" * 5000, "no JSON"),
+        ("x" * 200_000, "line too long"),
+    ],
+)
+def test_a_monstrous_line_of_json_is_counted_and_stops_nothing(tmp_path: Path, line: str, reason: str) -> None:
+    good = '{"time": 1, "observer": 1, "target": 2, "range_m": 3.0}'
+    path = tmp_path / "ranges.jsonl"
+    path.write_text(f"{good}\n{line}\n{good}\n")
+    lines, counts = read(path)
+    assert len(lines) == 2
+    assert counts.lines == {reason: [2]}
+
+
+def test_a_stray_quote_costs_its_line_only(tmp_path: Path) -> None:
+    path = tmp_path / "ranges.csv"
+    path.write_text(HEADER + '1,1,2,3,0.1\n2,1,2,"3,0.1\n3,1,2,3,0.1\n')
+    lines, counts = read(path)
+    assert [line.time_s for line in lines] == [1.0, 3.0]
+    assert counts.lines == {"range_m no number": [3]}
+
+
+@pytest.mark.parametrize("content", [b"", b"\n\n", gzip.compress(b""), b"\x1f\x8b\x08broken", b"\x1f\x8b"])
+def test_a_file_without_a_line_is_refused_in_one_line(tmp_path: Path, content: bytes) -> None:
+    path = tmp_path / "none"
+    path.write_bytes(content)
+    with pytest.raises(ReplayError, match="or JSON lines, found no line that can be read"):
+        read(path)
+
+
+@pytest.mark.parametrize("beginning", [HEADER.encode(), b'{"time":5,"observer":1,"target":2,"range_m":4.0}\n'])
+@given(content=st.binary(max_size=400))
+def test_any_bytes_end_in_sound_ranges(
+    tmp_path_factory: pytest.TempPathFactory, beginning: bytes, content: bytes
+) -> None:
     path = tmp_path_factory.mktemp("fuzz") / "x.csv"
-    path.write_bytes(HEADER.encode() + content)
+    path.write_bytes(beginning + content)
     for line in read(path)[0]:
         assert math.isfinite(line.time_s)
         assert line.range_m > 0.0

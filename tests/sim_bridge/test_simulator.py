@@ -15,9 +15,10 @@ from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from agent.config import FleetConfig, config_from
 from agent.endpoints import parse_endpoint
+from sim_bridge.range_sessions import range_session_settings
 from sim_bridge.scenario import ScenarioError, Vehicle
 from sim_bridge.simulation import Simulation
-from sim_bridge.simulator import Simulator, range_session_settings, simulate, stop_signals
+from sim_bridge.simulator import Simulator, simulate, stop_signals
 from sim_bridge.truth import load_truth
 from sim_bridge.udp_autopilot import MAX_DATAGRAM_BYTES, PortError, open_port
 from transport.session import Handlers, open_session

@@ -47,12 +47,6 @@ def test_interpolation_agrees_with_the_world_between_the_samples(flown):
     np.testing.assert_array_equal(truth.at(times[7]), got[7])
 
 
-def test_ticks_are_times_since_the_epoch(flown):
-    truth = flown[0].truth()
-    ticks = np.array([500, 505, 510])
-    np.testing.assert_array_equal(truth.at_ticks(ticks, 0.1, 1.7e9), truth.at(1.7e9 + 0.1 * ticks))
-
-
 def test_times_outside_are_refused(flown):
     truth = flown[0].truth()
     for time in (truth.time_unix_s[0] - 0.1, truth.time_unix_s[-1] + 0.1, np.nan):

@@ -11,7 +11,6 @@ from collections.abc import Iterator
 
 from agent.config_tables import FleetConfig
 from agent.endpoints import parse_endpoint
-from agent.errors import ConfigError, EndpointError
 from agent.frames import FleetFrame
 from agent.mavlink_codec import Encoder, Message, mavlink
 from agent.mavlink_link import create_link
@@ -82,15 +81,11 @@ def _bounded(value: float, bits: int) -> int:
 class AdsbReporter(Observer):
     """Sends the neighbours to ``config.adsb.address``, which is given; ``sent`` counts messages.
 
-    ``signing`` where the link is to be signed. Raises `ConfigError` for an address that is none.
+    ``signing`` where the link is to be signed.
     """
 
     def __init__(self, config: FleetConfig, agent_id: int, signing: LinkSigning | None = None) -> None:
-        try:
-            endpoint = parse_endpoint(config.adsb.address or "")
-        except EndpointError as error:
-            raise ConfigError("adsb", "address", "a MAVLink address such as udpout:HOST:PORT", str(error)) from error
-        self._link = create_link(endpoint, _is_mavlink)
+        self._link = create_link(parse_endpoint(config.adsb.address or ""), _is_mavlink)
         self._encoder = Encoder(config.system_id(agent_id), config.mavlink.component_id, signing)
         self._signing = signing
         self._config = config

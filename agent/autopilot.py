@@ -81,7 +81,7 @@ class AutopilotSession:
         self.system_status: int | None = mavlink.MAV_STATE_STANDBY
         """What our heartbeat says; ``None`` = a fault: send none."""
         self.heard = 0
-        """Messages of the autopilot's system, whatever its component."""
+        """Messages of the autopilot's system, whatever its component but our own."""
         self.reboots = 0
         self.ignored: Counter[str] = Counter()
         self._last_heartbeat_s = 0.0
@@ -99,7 +99,11 @@ class AutopilotSession:
         """Take in bytes of the link; the samples they hold. Answers are fetched by `to_send`."""
         samples = []
         self._tell_time(now_s)
+        own = (self._encoder.system_id, self._encoder.component_id)
         for message in self.decoder.feed(data):
+            if (message.get_srcSystem(), message.get_srcComponent()) == own:
+                self.ignored["own frame"] += 1  # sent back to us, well signed or not: nobody's word but ours
+                continue
             self.heard += message.get_srcSystem() == self._expected_system
             sample = self._on_message(message, now_s)
             if sample is not None:

@@ -17,6 +17,7 @@ from typing import Any
 
 import msgspec
 
+from agent.config_checks import check_fleet
 from agent.config_tables import AgentTable as AgentTable
 from agent.config_tables import CirclePath as CirclePath
 from agent.config_tables import FigureEightPath as FigureEightPath
@@ -33,15 +34,10 @@ from agent.config_tables import SensorsTable as SensorsTable
 from agent.config_tables import SimTable as SimTable
 from agent.config_tables import TransportTable as TransportTable
 from agent.config_tables import WaypointsPath as WaypointsPath
-from agent.endpoints import SPELLINGS, LinkKind, parse_endpoint
-from agent.errors import ConfigError, EndpointError
+from agent.errors import ConfigError
 from estimators.settings import EstimatorSettings, with_kind_defaults
 
 MAX_FILE_BYTES = 1_000_000
-IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
-OTHER_BYTES_PER_S = 500
-"""Heartbeats, TIMESYNC and the like, with room for what the autopilot sends by itself."""
-BAUD_SHARE, BITS_PER_BYTE = 0.7, 10
 OVERRIDE = "override"
 PLAIN_NAMES = {
     "float": "a number",
@@ -90,7 +86,7 @@ def load_estimator_settings(path: str | FilePath | None, overrides: Iterable[str
         "agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:0"}],
     }
     table = {"estimator": document["estimator"]} if "estimator" in document else {}
-    return config_from(stub | table, "defaults" if path is None else str(path), overrides).estimator
+    return _decoded(stub | table, "defaults" if path is None else str(path), overrides).estimator
 
 
 def read_document(path: str | FilePath) -> dict[str, Any]:
@@ -124,24 +120,30 @@ def _laid_over(below: Any, above: Any) -> Any:
 
 
 def _have_ids(value: Any) -> bool:
-    return isinstance(value, list) and all(isinstance(each, dict) and "id" in each for each in value)
+    return isinstance(value, list) and all(isinstance(each, dict) and _is_id(each.get("id")) for each in value)
+
+
+def _is_id(value: Any) -> bool:
+    return isinstance(value, int | str)
 
 
 def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] = ()) -> FleetConfig:
     """The checked configuration of a decoded TOML document; ``where`` names it in errors."""
+    config = _decoded(document, where, overrides)
+    check_fleet(config, where)
+    return config
+
+
+def _decoded(document: dict[str, Any], where: str, overrides: Iterable[str]) -> FleetConfig:
+    """Every setting by itself as it may be; what has to hold between them is not looked at."""
     overridden = {_override(document, override) for override in overrides}
     _check_finite(document, where, "")
     if isinstance(document.get("estimator"), dict):
         document = document | {"estimator": with_kind_defaults(document["estimator"])}
     try:
-        config = msgspec.convert(document, FleetConfig)
+        return msgspec.convert(document, FleetConfig)
     except msgspec.ValidationError as error:
         raise _explained(error, document, where, overridden) from error
-    _check_agents(config, where)
-    _check_references(config, where)
-    _check_times(config, where)
-    _check_radio(config, where)
-    return config
 
 
 def dump(config: FleetConfig) -> str:
@@ -298,95 +300,3 @@ def _check_finite(value: Any, where: str, key: str) -> None:
             _check_finite(item, where, f"{key}[{index}]")
     elif isinstance(value, float) and not math.isfinite(value):
         raise ConfigError(where, key, "a finite number", str(value))
-
-
-def _check_agents(config: FleetConfig, where: str) -> None:
-    seen: dict[str, int] = {}
-    for index, agent in enumerate(config.agents):
-        if agent.id in config.ids[:index]:
-            raise ConfigError(where, f"agents[{index}].id", "distinct ids", f"a second agent {agent.id}")
-        key = f"agents[{index}].mavlink"
-        try:
-            endpoint = parse_endpoint(agent.mavlink)
-        except EndpointError as error:
-            raise ConfigError(where, key, SPELLINGS, str(error)) from error
-        opened = f"{endpoint.host}:{endpoint.port}" if endpoint.kind is not LinkKind.SERIAL else endpoint.host
-        opened = f"{agent.radio or ''} {opened}"  # an address of its own on the radio is a computer of its own
-        if opened in seen and not opened.endswith(":0"):
-            raise ConfigError(where, key, f"another address than agent {seen[opened]}'s", repr(agent.mavlink))
-        seen[opened] = agent.id
-        if endpoint.kind is LinkKind.SERIAL:
-            _check_baud(config, where, key, endpoint.port)
-        if agent.id > 255 and agent.system_id is None:
-            expected = f"1..255, since the id {agent.id} is no system id"
-            raise ConfigError(where, f"agents[{index}].system_id", expected, "nothing")
-
-
-def _check_baud(config: FleetConfig, where: str, key: str, baud: int) -> None:
-    """Refuse a serial line that the requested streams would fill: frames would be lost without a word."""
-    settings = config.mavlink
-    needed = (
-        settings.imu_hz * IMU_FRAME_BYTES
-        + settings.attitude_hz * ATTITUDE_FRAME_BYTES
-        + settings.gps_hz * GPS_FRAME_BYTES
-        + OTHER_BYTES_PER_S
-    )
-    usable = BAUD_SHARE * baud / BITS_PER_BYTE
-    if needed > usable:
-        expected = f"a baud rate of {needed * BITS_PER_BYTE / BAUD_SHARE:.0f} or more for the rates in [mavlink]"
-        raise ConfigError(where, key, expected, str(baud))
-
-
-def _check_references(config: FleetConfig, where: str) -> None:
-    for index, edge in enumerate(config.fleet.edges or ()):
-        _known(config, where, f"fleet.edges[{index}]", edge)
-        if edge[0] == edge[1]:
-            raise ConfigError(where, f"fleet.edges[{index}]", "two different agents", f"{list(edge)}")
-    for index, outage in enumerate(config.sim.gps_outages):
-        key = f"sim.gps_outages[{index}]"
-        _known(config, where, f"{key}.agent", (outage.agent,))
-        if outage.to_s <= outage.from_s:
-            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
-    flown: set[int] = set()
-    for index, path in enumerate(config.sim.paths):
-        key = f"sim.paths[{index}].agent"
-        _known(config, where, key, (path.agent,))
-        if path.agent in flown:
-            raise ConfigError(where, key, "one path per agent", f"a second path of agent {path.agent}")
-        flown.add(path.agent)
-
-
-def _check_radio(config: FleetConfig, where: str) -> None:
-    """Datagrams between machines need addresses; the endpoints on loopback need free ports."""
-    transport = config.transport
-    for index, agent in enumerate(config.agents):
-        if transport.link != "tcp" and agent.radio is None and (agent.listen or agent.connect):
-            expected = f"an address, since transport.link is {transport.link} and listen or connect is given"
-            raise ConfigError(where, f"agents[{index}].radio", expected, "nothing")
-    for index, outage in enumerate(transport.faults.outages):
-        key = f"transport.faults.outages[{index}]"
-        _known(config, where, f"{key}.receivers", outage.receivers)
-        _known(config, where, f"{key}.senders", outage.senders)
-        if outage.to_s <= outage.from_s:
-            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
-
-
-def _known(config: FleetConfig, where: str, key: str, ids: Iterable[int]) -> None:
-    for agent_id in ids:
-        if agent_id not in config.ids:
-            raise ConfigError(where, key, f"ids of agents ({', '.join(map(str, config.ids))})", str(agent_id))
-
-
-def _check_times(config: FleetConfig, where: str) -> None:
-    transport = config.transport
-    used = transport.exchange_fraction + transport.rounds_fraction
-    if used > 1.0:
-        expected = "at most 1 together with transport.exchange_fraction"
-        raise ConfigError(where, "transport.rounds_fraction", expected, f"{used:g}")
-    if transport.guard_s >= transport.exchange_fraction * config.fleet.period_s:
-        expected = "less than transport.exchange_fraction of fleet.period_s"
-        raise ConfigError(where, "transport.guard_s", expected, f"{transport.guard_s:g}")
-    last = transport.base_port + (1 if transport.link == "tcp" else 2) * len(config.agents) - 1
-    if last > 65535:
-        found = f"{last} for the last"
-        raise ConfigError(where, "transport.base_port", "a port for each agent up to 65535", found)

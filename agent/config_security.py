@@ -16,7 +16,8 @@ class SecurityTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     profile: Profile = "lab"
     """``lab``: plain links, packets signed unless ``mode`` says otherwise. ``field``: mutual TLS, access control,
     signed packets, MAVLink signed where it leaves the machine. ``lossy_field``: the same without TLS, for links that
-    lose much. A field profile does not start while anything that it promises is missing."""
+    lose much; UWB frames have to be sealed. A field profile does not start while anything that it promises is
+    missing."""
     mode: Literal["signed", "unsigned"] = "signed"
     """Signatures of packets. Unsigned is for the lab and has to be asked for."""
     encrypt: bool = False
@@ -25,6 +26,6 @@ class SecurityTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_
     """Folder of the key files, relative to the configuration file."""
     state: str | None = None
     """Folder for what must outlive a restart (start numbers, MAVLink stamps), relative to the configuration file;
-    absent = the key folder, which the daemon then writes to."""
+    absent = the key folder, which the daemon then writes to. Made where only itself is missing."""
     freshness_s: Positive = 10.0
     """Packets whose sender's UTC clock differs by more are refused, which also stops replays after a restart."""

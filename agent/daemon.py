@@ -17,7 +17,7 @@ from typing import Any
 
 from agent.autopilot import LinkState
 from agent.config_tables import FleetConfig
-from agent.core import AgentCore, EstimatorFactory
+from agent.core import ESTIMATOR_FAULTS, AgentCore, EstimatorFactory
 from agent.diagnostics import (
     ProcessUse,
     TickTimes,
@@ -29,6 +29,7 @@ from agent.diagnostics import (
 from agent.endpoints import parse_endpoint
 from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
 from agent.exit_codes import ExitCode
+from agent.faults import ProgramFaults
 from agent.mavlink_link import create_link
 from agent.mavlink_stamps import StampKeeper
 from agent.observers import DaemonState, Observer
@@ -38,12 +39,13 @@ from agent.radio import Radio
 from agent.run_record import RunRecord
 from agent.security import mavlink_signing, stamp_file
 from agent.warmup import warm_up
-from transport.errors import KeyFileError, SessionError, SettingsError
+from transport.errors import KeyFileError, SessionError, SettingsError, UnwritableError
 
 LOG = logging.getLogger("fleetloc.agent")
 MAVLINK_PERIOD_S = 0.05
 HOUSEKEEPING_PERIOD_S = 1.0
-MAX_FAULT_TRACES = 10
+RENEW_PERIOD_S = 10.0
+"""While the autopilot is lost, a link that is a connection is dialled anew this often: the other end may be gone."""
 FAULT_LINE_PERIOD_S = 10.0
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
@@ -51,6 +53,7 @@ EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
     (SettingsError, ExitCode.CONFIG),
     (NoAutopilotError, ExitCode.NO_AUTOPILOT),
     (LinkError, ExitCode.LINK),
+    (UnwritableError, ExitCode.STATE),
     (KeyFileError, ExitCode.KEYS),
     (SessionError, ExitCode.SESSION),
     (RecordError, ExitCode.RECORD),
@@ -121,7 +124,8 @@ class Daemon:
         self._use = ProcessUse()
         self._tick_timer: asyncio.TimerHandle | None = None
         self._computing_s = 0.0
-        self._faults = 0
+        self._faults = ProgramFaults(agent_id)
+        self._left_out = 0
         self._next_fault_line_s = 0.0
         self._stop = asyncio.Event()
         self._failure: AgentError | None = None
@@ -168,10 +172,8 @@ class Daemon:
         self._stop.set()
 
     def _on_callback_error(self, _loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-        """A fault of the program in one callback: said loudly (at first), counted, and flown on with."""
-        self._faults += 1
-        if self._faults <= MAX_FAULT_TRACES:
-            LOG.error("agent %d: %s", self._agent_id, context["message"], exc_info=context.get("exception"))
+        """A fault of the program in one callback: counted, and flown on with."""
+        self._faults.note(context["message"], context.get("exception"))
 
     def _on_task_done(self, task: asyncio.Task[None]) -> None:
         if task.cancelled():
@@ -190,9 +192,11 @@ class Daemon:
         for task in tasks:
             task.cancel()
         await asyncio.gather(*tasks, return_exceptions=True)  # their failures are in `_failure` already
-        await self.radio.close()
-        await self._link.close()
-        state = self.state()
+        with self._faults.survived("closing the radio"):  # whatever fails here, the record gets its end
+            await self.radio.close()
+        with self._faults.survived("closing the autopilot's link"):
+            await self._link.close()
+        state = self._last_state()
         last: list[Observer] = [] if self._record is None else [self._record]
         ends = [observer.close(state) for observer in (*self._observers, *last)]
         for error in await asyncio.gather(*ends, return_exceptions=True):
@@ -201,26 +205,38 @@ class Daemon:
             elif error is not None:
                 LOG.error("agent %d: an observer failed to close", self._agent_id, exc_info=error)
 
+    def _last_state(self) -> DaemonState:
+        with self._faults.survived("taking stock"):
+            return self.state()
+        counters = {"program faults": self._faults.count}
+        return DaemonState(self._agent_id, 0.0, self.core.health.health, counters, {}, {})
+
     # --- MAVLink -------------------------------------------------------------------------------------------
 
     def _on_mavlink(self, data: bytes) -> bool:
-        return self.onboard.on_mavlink(data, time.monotonic())
+        with self._faults.survived("reading the autopilot's link"):
+            return self.onboard.on_mavlink(data, time.monotonic())
+        return False
 
     async def _serve_mavlink(self) -> None:
         """Send what is due on the autopilot's link, and say when its state changes."""
         state = LinkState.SEARCHING
         started_s = time.monotonic()
-        changed_s = started_s
+        changed_s = renew_s = started_s
         limit_s, end_after_s = self._config.mavlink.appear_timeout_s, self._config.mavlink.end_after_lost_s
         while True:
             host_s = time.monotonic()
-            for frame in self.onboard.serve_autopilot(host_s):
-                self._link.send(frame)
+            with self._faults.survived("serving the autopilot"):
+                for frame in self.onboard.serve_autopilot(host_s):
+                    self._link.send(frame)
             if self.onboard.autopilot.state is not state:
                 state, changed_s = self.onboard.autopilot.state, host_s
                 if state is LinkState.CONNECTED:
                     self.radio.begin_flight(host_s)
                 LOG.info("agent %d: autopilot %s, %s", self._agent_id, state, self._link.description)
+            if state is LinkState.LOST and host_s >= renew_s:
+                renew_s = host_s + RENEW_PERIOD_S
+                self._link.renew()
             if state is LinkState.SEARCHING and 0 < limit_s < host_s - started_s:
                 raise NoAutopilotError(self._searched_in_vain(limit_s))
             if state is LinkState.LOST and end_after_s is not None and host_s - changed_s > end_after_s:
@@ -241,29 +257,35 @@ class Daemon:
     # --- radio ---------------------------------------------------------------------------------------------
 
     def _on_packet(self, key: str, data: bytes, arrived_s: float, unix_ns: int) -> None:
-        self.onboard.on_packet(key, data, arrived_s=arrived_s, host_s=time.monotonic(), unix_ns=unix_ns)
+        with self._faults.survived("taking a packet"):
+            self.onboard.on_packet(key, data, arrived_s=arrived_s, host_s=time.monotonic(), unix_ns=unix_ns)
         self._advance()
 
     def _on_uwb(self, payload: bytes, arrived_s: float) -> None:
-        self.onboard.on_uwb(payload, arrived_s)
+        with self._faults.survived("taking a range"):
+            self.onboard.on_uwb(payload, arrived_s)
 
     def _on_gone(self, agent_id: int) -> None:
-        self.onboard.on_gone(agent_id, time.monotonic())
+        with self._faults.survived("letting a neighbour go"):
+            self.onboard.on_gone(agent_id, time.monotonic())
         self._advance()
 
     # --- the core ------------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        """Let the core do what is due, put out what it gives, and come back when it wants to."""
+        """Let the core do what is due, put out what it gives, and come back when it wants to.
+
+        Raises nothing, for it is called from the midst of other things; should the core fail, the next period tries
+        again.
+        """
         if self._stop.is_set():
             return
         if self._tick_timer is not None:
             self._tick_timer.cancel()
         host_s = time.monotonic()
-        # Should the core fail, the loop reports it and the next period tries again.
         due_host_s = retry_host_s = host_s + self._config.fleet.period_s
         began_s = time.perf_counter()
-        try:
+        with self._faults.survived("the tick"):
             outputs = self.onboard.advance(host_s)
             for output in outputs:
                 if isinstance(output, Send):
@@ -271,8 +293,7 @@ class Daemon:
             self._computing_s += time.perf_counter() - began_s
             self._report(outputs)
             due_host_s = self.onboard.next_due_host_s() or retry_host_s
-        finally:
-            self._tick_timer = asyncio.get_running_loop().call_at(due_host_s, self._advance)
+        self._tick_timer = asyncio.get_running_loop().call_at(due_host_s, self._advance)
 
     def _report(self, outputs: list[Output]) -> None:
         for output in outputs:
@@ -296,7 +317,9 @@ class Daemon:
         """Say what the estimator raised, once in a while; every fault is counted."""
         fault, self.core.last_fault = self.core.last_fault, None
         host_s = time.monotonic()
-        if fault is not None and host_s >= self._next_fault_line_s:
+        if fault is not None and not isinstance(fault, ESTIMATOR_FAULTS):
+            self._faults.note("a step of the tick failed; its estimate is made of the last one", fault)
+        elif fault is not None and host_s >= self._next_fault_line_s:
             self._next_fault_line_s = host_s + FAULT_LINE_PERIOD_S
             LOG.error("agent %d: estimator fault, starting it anew: %r", self._agent_id, fault)
 
@@ -305,24 +328,32 @@ class Daemon:
     async def _keep_house(self) -> None:
         while True:
             await asyncio.sleep(HOUSEKEEPING_PERIOD_S)
-            if self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()):
-                LOG.warning("agent %d: the system's clock stepped; starting anew", self._agent_id)
-                self._advance()
-            state = self.state()
-            message = diagnostics_of(self._agent_id, self.core, state.counters, state.gauges, state.neighbours)
-            self.radio.send(message)
-            if self._record is not None:
-                self._record.on_second(state)
-            for observer in self._observers:
-                self._tell(observer.on_second, state)
-            await self.radio.ask_clocks()
+            with self._faults.survived("keeping house"):
+                if self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()):
+                    LOG.warning("agent %d: the system's clock stepped; starting anew", self._agent_id)
+                    self._advance()
+            with self._faults.survived("telling the state"):
+                self._tell_state()
+            with self._faults.survived("asking for clocks"):
+                await self.radio.ask_clocks()
+
+    def _tell_state(self) -> None:
+        state = self.state()
+        for observer in self._observers:
+            self._tell(observer.on_second, state)
+        if self._record is not None:
+            self._record.on_second(state)
+        message = diagnostics_of(self._agent_id, self.core, state.counters, state.gauges, state.neighbours)
+        self._left_out += len(state.neighbours) - len(message.neighbours)
+        self.radio.send(message)
 
     def state(self) -> DaemonState:
         """How the daemon is at this moment."""
         onboard, host_s = self.onboard, time.monotonic()
         now_s = onboard.fleet_s(host_s)
         counters = counters_of(self.core, onboard.autopilot, self._link, onboard.uwb, onboard.opener)
-        counters |= self.radio.counters() | {"program faults": self._faults}
+        counters |= self.radio.counters() | {"program faults": self._faults.count}
+        counters["diagnostics left out"] = self._left_out
         if self._record is not None:
             counters |= self._record.counters()
         gauges = gauges_of(self.core, onboard.autopilot, now_s) | self._ticks.gauges() | self._use.gauges()

@@ -10,17 +10,21 @@ from collections import deque
 from collections.abc import Iterable
 from pathlib import Path
 
+import msgspec
 import numpy as np
 
 from agent.autopilot import AutopilotSession
 from agent.core import AgentCore
 from agent.mavlink_link import MavlinkLink
 from agent.uwb import UwbAdapter
+from transport.header import MAX_BODY_BYTES, Kind
 from transport.opening import Opener
 from transport.report_body import Diagnostics
 
 TICKS_REMEMBERED = 1024
-MAX_NAME = 64
+TICKS_REMEMBERED = 1024
+MAX_NAME, MAX_REASON, MAX_NEIGHBOURS = 64, 128, 256
+"""Characters of a name, of a reason, and neighbours: more a packet of diagnostics does not hold."""
 
 
 class TickTimes:
@@ -136,6 +140,20 @@ def diagnostics_of(
     gauges: dict[str, float],
     neighbours: dict[str, dict[str, float]],
 ) -> Diagnostics:
-    """The message that goes out."""
+    """The message that goes out; of very many neighbours the first ones, as many as fit into it."""
     health = core.health.health
-    return Diagnostics(agent_id, str(health.state), health.reasons, counters, gauges, neighbours)
+    reasons = tuple(reason[:MAX_REASON] for reason in health.reasons)
+    message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges)
+    return msgspec.structs.replace(message, neighbours=_fitting(neighbours, len(msgspec.json.encode(message))))
+
+
+def _fitting(neighbours: dict[str, dict[str, float]], taken_bytes: int) -> dict[str, dict[str, float]]:
+    """Neighbours for whom a body has room that already holds so many bytes."""
+    left_bytes = MAX_BODY_BYTES[Kind.DIAG] - taken_bytes - len(',"neighbours":{}')
+    fitting: dict[str, dict[str, float]] = {}
+    for agent_id, gauges in neighbours.items():
+        left_bytes -= len(msgspec.json.encode({agent_id: gauges})) - len("{}") + len(",")
+        if left_bytes < 0 or len(fitting) == MAX_NEIGHBOURS:
+            break
+        fitting[agent_id] = gauges
+    return fitting

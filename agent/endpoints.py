@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from agent.errors import EndpointError
+from transport.addresses import is_host
 
 SPELLINGS = (
     "udpin:HOST:PORT, udpout:HOST:PORT, tcpin:HOST:PORT, tcpout:HOST:PORT (each also as scheme://HOST:PORT) "
@@ -68,6 +69,8 @@ def parse_endpoint(text: str) -> Endpoint:
     if not re.fullmatch(r"[0-9]{1,5}", port) or int(port) > 65535:
         raise EndpointError(f"{text!r}, whose port {port!r} is not 0..65535")
     host = host.strip("[]")
+    if host and not is_host(host):
+        raise EndpointError(f"{text!r}, whose host {host!r} is no address and no name")
     if not host and SCHEMES[scheme] in (LinkKind.UDP_OUT, LinkKind.TCP_OUT):
         raise EndpointError(f"{text!r}, which has no host to connect to")
     return Endpoint(SCHEMES[scheme], host or "0.0.0.0", int(port))

@@ -13,6 +13,14 @@ from __future__ import annotations
 
 from transport.errors import KeyFileError
 
+OPENING_FAULTS = (OSError, OverflowError, ValueError)
+"""What opening an address, port or path raises: refused by the system, out of range, or no name at all."""
+
+
+def cause_of(error: Exception) -> str:
+    """What is wrong, in the system's words where it has any."""
+    return (error.strerror if isinstance(error, OSError) else None) or str(error)
+
 
 class AgentError(Exception):
     """Root of everything that the agent raises on purpose."""

@@ -17,7 +17,7 @@ class ExitCode(IntEnum):
     CONFIG = 3
     """The configuration cannot be used."""
     LINK = 4
-    """The autopilot's link cannot be opened: port taken, no such device."""
+    """The autopilot's link, the health socket or the metrics' port cannot be opened: taken, no such device."""
     KEYS = 5
     """A key file is missing, malformed or readable by others."""
     SESSION = 6
@@ -26,3 +26,5 @@ class ExitCode(IntEnum):
     """No autopilot appeared within ``mavlink.appear_timeout_s``."""
     RECORD = 8
     """The record cannot be written."""
+    STATE = 9
+    """What has to outlive a restart cannot be written (a full disk); worth another try."""

@@ -14,6 +14,8 @@ FAULT_SIGMA_M = 50.0
 ALIGNED_SIGMA_M = 2.0
 DIRECTIONS = 3
 """Neighbours, and directions to them, that hold a drone without GPS."""
+MAX_NAMED = 8
+"""Silent neighbours named in a reason; of more, their number."""
 REPORT_PERIOD_S = 1.0
 """A state that flaps is reported no more often than this; what is reported is the latest."""
 
@@ -51,7 +53,7 @@ class Facts:
     waiting_for: str = ""
     """What the start waits for."""
     located_neighbours: int = 0
-    """Neighbours whose place is known and which are ranged."""
+    """Neighbours whose place is known and which are ranged; of interest, and counted, without GPS only."""
     directions: int = 0
     """Directions of space (0..3) that the ranges to them hold: less than 3 where all lie in one plane with us."""
     ambiguous: bool = False
@@ -81,7 +83,7 @@ def assess(facts: Facts, was: State) -> Health:
 
 def _unheld(facts: Facts) -> tuple[str, ...]:
     """Why the own position cannot be observed; empty if it can, or nothing is estimated yet."""
-    if facts.status is None or not _lost_gps(facts):
+    if facts.status is None or not gps_lost(facts.gps_age_s):
         return ("not observable",) if facts.status is Status.NOT_OBSERVABLE else ()
     if facts.ambiguous:
         return ("not observable: the ranges leave more than one place",)
@@ -113,15 +115,29 @@ def _missing(facts: Facts) -> tuple[str, ...]:
         reasons.append(f"autopilot {facts.autopilot}")
     if facts.imu_coverage < MIN_IMU_COVERAGE:
         reasons.append("IMU incomplete")
-    if _lost_gps(facts):
+    if gps_lost(facts.gps_age_s):
         reasons.append("no GPS")
     if facts.silent_neighbours:
-        reasons.append(f"not heard: {', '.join(map(str, facts.silent_neighbours))}")
+        reasons.append(f"not heard: {_listed(facts.silent_neighbours)}")
     return tuple(reasons)
 
 
-def _lost_gps(facts: Facts) -> bool:
-    return facts.gps_age_s is None or facts.gps_age_s > GPS_LOST_S
+def _listed(agents: tuple[int, ...]) -> str:
+    """Ids, of many the first ones: a reason has to fit into a packet."""
+    named = ", ".join(map(str, agents[:MAX_NAMED]))
+    return named if len(agents) <= MAX_NAMED else f"{named}, ... and {len(agents) - MAX_NAMED} more"
+
+
+def gps_lost(gps_age_s: float | None) -> bool:
+    """Whether a drone has to do without GPS, by the time since its last fix (``None``: there was none)."""
+    return gps_age_s is None or gps_age_s > GPS_LOST_S
+
+
+def _with_standing(health: Health, standing: tuple[str, ...]) -> Health:
+    if not standing:
+        return health
+    state = State.DEGRADED if health.state is State.OK else health.state
+    return replace(health, state=state, reasons=(*standing, *health.reasons))
 
 
 class HealthMonitor:
@@ -130,12 +146,14 @@ class HealthMonitor:
     def __init__(self) -> None:
         self.health = Health(State.INIT, ())
         self.changes = 0
+        self.standing: tuple[str, ...] = ()
+        """Reasons that do not follow from the facts; set by the owner."""
         self._reported = self.health
         self._next_report_s = float("-inf")
 
     def update(self, facts: Facts, now_s: float) -> Health | None:
         """Take in facts; the health if there is a change to be reported now."""
-        health = assess(facts, self.health.state)
+        health = _with_standing(assess(facts, self.health.state), self.standing)
         self.changes += health != self.health
         self.health = health
         if health == self._reported or now_s < self._next_report_s:

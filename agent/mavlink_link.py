@@ -15,16 +15,19 @@ from collections.abc import Callable
 from typing import Any
 
 from agent.endpoints import Endpoint, LinkKind
-from agent.errors import LinkError
+from agent.errors import OPENING_FAULTS, LinkError, cause_of
 
 REOPEN_S = 1.0
+DIAL_TIMEOUT_S = 10.0
 READ_BYTES = 4096
 MAX_WRITE_BUFFER_BYTES = 64 * 1024
 RECEIVE_BUFFER_BYTES = 1 << 20
 """Of a UDP socket: a moment without the processor must not lose samples (a small datagram takes almost 1 kB)."""
+LIVENESS = {"TCP_KEEPIDLE": 5, "TCP_KEEPINTVL": 2, "TCP_KEEPCNT": 3, "TCP_USER_TIMEOUT": 10_000}
+"""Socket options, where there are such: an end that vanished is noticed after some 10 s, not after 15 minutes."""
 
 OnData = Callable[[bytes], bool]
-"""Takes received bytes, tells whether a frame of the autopilot was in them."""
+"""Takes received bytes, tells whether a frame of the autopilot was in them; raises nothing."""
 
 
 class MavlinkLink(ABC):
@@ -60,8 +63,12 @@ class MavlinkLink(ABC):
         """Send one frame; dropped and counted if the link is not ready."""
 
     @abstractmethod
+    def renew(self) -> None:
+        """Nothing comes any more: drop a connection, whose other end may have gone unnoticed; it is made again."""
+
+    @abstractmethod
     async def close(self) -> None:
-        """Close the link for good."""
+        """Close the link for good; raises nothing for a link that failed."""
 
 
 def create_link(endpoint: Endpoint, on_data: OnData) -> MavlinkLink:
@@ -95,7 +102,7 @@ class UdpLink(MavlinkLink, asyncio.DatagramProtocol):
                 self._transport, _ = await loop.create_datagram_endpoint(lambda: self, local_addr=address)
             else:
                 self._transport, _ = await loop.create_datagram_endpoint(lambda: self, remote_addr=address)
-        except OSError as error:
+        except OPENING_FAULTS as error:
             raise _unusable(self.endpoint, error) from error
         socket_of_link: socket.socket = self._transport.get_extra_info("socket")
         socket_of_link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
@@ -130,6 +137,9 @@ class UdpLink(MavlinkLink, asyncio.DatagramProtocol):
         else:
             self.dropped += 1
 
+    def renew(self) -> None:
+        """There is no connection."""
+
     async def close(self) -> None:
         if self._transport is not None:
             self._transport.close()
@@ -152,37 +162,49 @@ class TcpLink(MavlinkLink):
     async def open(self) -> None:
         host, port = self.endpoint.host, self.endpoint.port
         if self.endpoint.kind is LinkKind.TCP_OUT:
+            self._check_host()
             self._task = asyncio.create_task(self._dial(), name=f"mavlink {self.endpoint}")
             return
         try:
             self._server = await asyncio.start_server(self._serve, host, port)
-        except OSError as error:
+        except OPENING_FAULTS as error:
+            raise _unusable(self.endpoint, error) from error
+
+    def _check_host(self) -> None:
+        """Refuse what can be neither name nor address; a name is looked up whenever it is dialled."""
+        try:
+            self.endpoint.host.encode("idna")
+            socket.inet_pton(socket.AF_INET, self.endpoint.host)
+        except OSError:  # not an address of IPv4
+            return
+        except ValueError as error:
             raise _unusable(self.endpoint, error) from error
 
     async def _dial(self) -> None:
         while True:
             try:
-                reader, writer = await asyncio.open_connection(self.endpoint.host, self.endpoint.port)
-            except OSError:
+                async with asyncio.timeout(DIAL_TIMEOUT_S):
+                    reader, writer = await asyncio.open_connection(self.endpoint.host, self.endpoint.port)
+            except OPENING_FAULTS:
                 self.dropped += 1
             else:
                 await self._serve(reader, writer)
             await asyncio.sleep(REOPEN_S)
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        if self._writer is not None:
-            self._writer.close()
+        self.renew()
         self._writer = writer
         self.opened += 1
-        host, port = writer.get_extra_info("peername")[:2]
+        host, port = (writer.get_extra_info("peername") or ("gone", 0))[:2]  # it may have failed already
         self.peer = f"{host}:{port}"
         try:
+            _watch(writer.get_extra_info("socket"))
             while data := await reader.read(READ_BYTES):
                 self._on_data(data)
-        except ConnectionError:
+        except OSError:  # also TimeoutError, "no route to host": the network is gone, not the link
             self.dropped += 1
         finally:
-            writer.close()
+            writer.transport.abort()
             if self._writer is writer:
                 self._writer, self.peer = None, ""
 
@@ -192,6 +214,10 @@ class TcpLink(MavlinkLink):
         else:
             self._writer.write(frame)
 
+    def renew(self) -> None:
+        if self._writer is not None:
+            self._writer.transport.abort()  # closing would wait until the other end has taken what is unsent
+
     async def close(self) -> None:
         if self._task is not None:
             self._task.cancel()
@@ -200,8 +226,8 @@ class TcpLink(MavlinkLink):
         if self._server is not None:
             self._server.close()
         if self._writer is not None:
-            self._writer.close()
-            with contextlib.suppress(ConnectionError):
+            self.renew()
+            with contextlib.suppress(OSError):  # that of a connection which has failed
                 await self._writer.wait_closed()
 
 
@@ -214,14 +240,15 @@ class SerialLink(MavlinkLink):
     async def open(self) -> None:
         try:
             self._open_device()
-        except OSError as error:
+        except OPENING_FAULTS as error:
             raise _unusable(self.endpoint, error) from error
 
     def _open_device(self) -> None:
         try:
             import serial
         except ImportError as error:
-            raise LinkError(f"{self.endpoint}: serial links need pyserial: install fleetloc[serial]") from error
+            remedy = "pip install '.[serial]' in the checkout of fleetloc"
+            raise LinkError(f"{self.endpoint}: serial links need pyserial: {remedy}") from error
         self._port = serial.Serial(self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True)
         self.opened += 1
         self.peer = self.endpoint.host
@@ -247,7 +274,7 @@ class SerialLink(MavlinkLink):
     def _try_again(self) -> None:
         try:
             self._open_device()
-        except OSError:
+        except OPENING_FAULTS:
             self.dropped += 1
             self._fail()
 
@@ -271,14 +298,25 @@ class SerialLink(MavlinkLink):
         if written < len(frame):  # the receiver resynchronises on the next frame
             self.dropped += 1
 
+    def renew(self) -> None:
+        """A device that is unplugged says so."""
+
     async def close(self) -> None:
         if self._reopen is not None:
             self._reopen.cancel()
         self._release()
 
 
-def _unusable(endpoint: Endpoint, error: OSError) -> LinkError:
+def _watch(connection: Any) -> None:
+    """Have the system notice that the other end of a connection has vanished."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+    for name, value in LIVENESS.items():
+        if hasattr(socket, name):
+            connection.setsockopt(socket.IPPROTO_TCP, getattr(socket, name), value)
+
+
+def _unusable(endpoint: Endpoint, error: Exception) -> LinkError:
     return LinkError(
-        f"mavlink {endpoint}: cannot be opened: {error.strerror or error}; "
+        f"mavlink {endpoint}: cannot be opened: {cause_of(error)}; "
         "expected a free port or an existing device that no other program uses"
     )

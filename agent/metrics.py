@@ -17,7 +17,7 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from agent.config_tables import FleetConfig
-from agent.errors import LinkError
+from agent.errors import OPENING_FAULTS, LinkError, cause_of
 from agent.health import State
 from agent.observers import DaemonState, Observer
 from agent.outputs import EstimateReady
@@ -34,7 +34,7 @@ REASON_TABLES = (
 )
 """Counters of `agent.diagnostics` by the begin of their name, the longer first; what follows is the reason."""
 UNITS = (("_s", "_seconds"), ("_m", "_meters"), ("_mps", "_meters_per_second"), ("_hz", "_hertz"))
-NEIGHBOUR_COUNTERS = ("received", "lost", "late", "restarts", "rejected")
+NEIGHBOUR_COUNTERS = ("received", "lost", "restarts", "rejected")
 TICK_BUCKETS_S = (0.002, 0.005, 0.01, 0.02, 0.03, 0.05, 0.075, 0.1, 0.2, 0.5, 1.0)
 AXES = ("north", "east", "down")
 
@@ -164,9 +164,9 @@ class Metrics(Observer, Collector):
         """Listen; raises `LinkError` naming the address."""
         try:
             self._server, self._thread = start_http_server(self._port, self._host, self.registry)
-        except OSError as error:
+        except OPENING_FAULTS as error:
             where = f"metrics {self._host}:{self._port}"
-            raise LinkError(f"{where}: cannot be listened on: {error.strerror or error}") from error
+            raise LinkError(f"{where}: cannot be listened on: {cause_of(error)}") from error
 
     def on_estimate(self, ready: EstimateReady, published_s: float, tick_time_s: float) -> None:
         self._compute.observe(tick_time_s)

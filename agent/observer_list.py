@@ -48,12 +48,8 @@ def _adsb_signing(config: FleetConfig, agent_id: int, base: Path) -> LinkSigning
     """As the profile demands of every MAVLink link that leaves the machine."""
     from transport.shared_keys import load_mavlink_key  # with its library: few fleets sign
 
-    address = config.adsb.address or ""
+    endpoint = parse_endpoint(config.adsb.address or "")
     wanted, promised = config.mavlink.signing, is_field(config)
-    try:
-        endpoint = parse_endpoint(address)
-    except ValueError as error:
-        raise ConfigError("adsb", "address", "a MAVLink address such as udpout:HOST:PORT", str(error)) from error
     if endpoint.kind is LinkKind.SERIAL:
         promised = False
     if wanted == "off" and promised and not _on_loopback(endpoint):

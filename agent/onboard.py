@@ -8,7 +8,7 @@ monotonic clock; fleet time follows from it and the fleet clock.
 from __future__ import annotations
 
 from agent.autopilot import AutopilotSession
-from agent.clock import FleetClock
+from agent.clock import FleetClock, clock_fault
 from agent.config_tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.endpoints import LinkKind, parse_endpoint
@@ -64,6 +64,7 @@ class OnboardAgent:
         self.opener = Opener(config.fleet.name, config.ids, trust, own_id=agent_id, freshness_s=freshness_s)
         self.journal: Journal | None = None
         """Told of every input."""
+        self._look_at_clock(host_s)
 
     def fleet_s(self, host_s: float) -> float:
         """Fleet time of a host time."""
@@ -141,6 +142,7 @@ class OnboardAgent:
         stepped = self.clock.sync(unix_s=unix_s, host_s=host_s)
         if stepped:
             self.core = self._new_core()
+        self._look_at_clock(host_s)
         return stepped
 
     def take(self, event: Input) -> list[Output]:
@@ -169,6 +171,11 @@ class OnboardAgent:
     def _note(self, event: Input, host_s: float) -> None:
         if self.journal is not None:
             self.journal.note(event, self.unix_s(host_s))
+
+    def _look_at_clock(self, host_s: float) -> None:
+        """An estimate whose tick fits no packet reaches nobody: say so in the health."""
+        fault = clock_fault(self._config.fleet, self.unix_s(host_s))
+        self.core.health.standing = () if fault is None else (fault,)
 
     def _new_core(self) -> AgentCore:
         return AgentCore(self._config, self._agent_id, self._make_estimator)

@@ -16,7 +16,7 @@ from agent.config_tables import FleetConfig
 from agent.radio_faults import channel_settings
 from agent.security import agent_session, credentials, expiry_warnings, new_salt
 from transport.channel import Channel, ChannelSettings
-from transport.clock_body import ClockAnswer, decode_clock_question, encode_clock_question
+from transport.clock_body import ClockAnswer, check_echo, decode_clock_question, encode_clock_question
 from transport.errors import EncodeError, Rejected, RejectionCounter
 from transport.information_body import Information
 from transport.sealing import Message, Packet, Sealer
@@ -57,7 +57,7 @@ class Radio:
         own = credentials(config, agent_id, base, unix_s=time.time(), salt=new_salt())
         for warning in expiry_warnings(config, agent_id, base, unix_s=time.time()):
             LOG.warning("agent %d: %s", agent_id, warning)
-        self.trust, self._envelopes = own.trust, own.envelopes
+        self.trust, self._envelopes, self._uwb_seal = own.trust, own.envelopes, own.uwb_seal
         self._settings = agent_session(config, agent_id, base)
         self._sealer = Sealer(self._fleet, agent_id, boot=own.boot, signing=own.signing)
         self._channel: Channel[tuple[str, bytes, float]] = Channel.seeded(
@@ -73,6 +73,7 @@ class Radio:
         self._session: Session | None = None
         self._unsent: Counter[str] = Counter()
         self._rejections = RejectionCounter()
+        self._uwb_rejections = RejectionCounter()
 
     async def open(self) -> None:
         """Open the session, listen to the neighbours, then show that we are there; raises `SessionError`."""
@@ -102,8 +103,10 @@ class Radio:
             double = self._double if isinstance(message, Information) else None
             packets = self._sealed(message, time.time_ns(), double)
         except EncodeError as error:
-            self._unsent[type(message).__name__] += 1
-            LOG.debug("agent %d: not sent: %s", self._agent_id, error)
+            kind = type(message).__name__
+            self._unsent[kind] += 1
+            level = logging.WARNING if self._unsent[kind] == 1 else logging.DEBUG
+            LOG.log(level, "agent %d: not sent: %s", self._agent_id, error)
             return
         for packet in packets:
             self._session.publish(packet.stream, packet.data)
@@ -121,14 +124,16 @@ class Radio:
     def counters(self) -> dict[str, int]:
         """What this side counts."""
         session = self._session
-        return {
+        counts = {
             "packets sent": self._sealer.sent,
             "packets unsent": self._unsent.total() + (session.failed if session else 0),
             "packets shed": session.shed if session else 0,
             "records left out": self._sealer.left_out,
             "injected losses": sum(self._channel.lost.values()),
             "subscriptions repeated": self._redeclared,
-        } | {f"rejected {reason}": count for reason, count in self._rejections.as_dict().items()}
+        }
+        counts |= {f"rejected {reason}": count for reason, count in self._rejections.as_dict().items()}
+        return counts | {f"rejected uwb {reason}": count for reason, count in self._uwb_rejections.as_dict().items()}
 
     async def ask_clocks(self) -> None:
         """Measure the offset of each neighbour's clock once."""
@@ -136,12 +141,13 @@ class Radio:
             await asyncio.gather(*(self._ask_clock(self._session, other) for other in self._neighbours))
 
     async def _ask_clock(self, session: Session, agent_id: int) -> None:
-        answer = await session.ask_clock(agent_id, encode_clock_question(time.time_ns()))
+        asked_ns = time.time_ns()
+        answer = await session.ask_clock(agent_id, encode_clock_question(asked_ns))
         if answer is None:
             return
         packet, arrived_ns = answer
         key = key_expression(self._fleet, agent_id, Stream.CLOCK)
-        self._hand_on(key, packet, time.monotonic(), arrived_ns)
+        self._hand_on(key, packet, time.monotonic(), arrived_ns, asked_ns)
 
     def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
         try:
@@ -160,11 +166,23 @@ class Radio:
             return  # not one of the keys that were subscribed to
         _, sender, stream = parsed
         if stream is Stream.UWB:
-            self._on_uwb(payload, arrived_s)
+            self._take_uwb(key, payload, arrived_s)
             return
         self._heard_s[sender] = arrived_s
         self._channel.offer(sender, (key, payload, arrived_s), arrived_s)
         self._deliver()
+
+    def _take_uwb(self, key: str, payload: bytes, arrived_s: float) -> None:
+        """Hand on a frame; where links are open to strangers, only one that our own driver sealed."""
+        if self._uwb_seal is not None:
+            try:
+                payload = self._uwb_seal.open(key, payload)
+            except Rejected as rejected:
+                first = not self._uwb_rejections[rejected.reason]
+                self._uwb_rejections.count(rejected.reason)
+                LOG.log(logging.WARNING if first else logging.DEBUG, "agent %d: %s", self._agent_id, rejected)
+                return
+        self._on_uwb(payload, arrived_s)
 
     def begin_flight(self, host_s: float) -> None:
         """The autopilot was heard: from the first such instant on count the times of injected outages."""
@@ -212,14 +230,19 @@ class Radio:
         if due_s is not None:
             self._timer = asyncio.get_running_loop().call_at(due_s, self._deliver)
 
-    def _hand_on(self, key: str, payload: bytes, arrived_s: float, unix_ns: int) -> None:
-        if self._envelopes is not None:
-            try:
+    def _hand_on(
+        self, key: str, payload: bytes, arrived_s: float, unix_ns: int, asked_ns: int | None = None
+    ) -> None:
+        """Hand on a packet as it was sealed; with ``asked_ns`` only if it answers the question asked then."""
+        try:
+            if self._envelopes is not None:
                 payload = self._envelopes.open(key, payload)
-            except Rejected as rejected:
-                self._rejections.count(rejected.reason)
-                LOG.debug("agent %d: %s", self._agent_id, rejected)
-                return
+            if asked_ns is not None:
+                check_echo(payload, asked_ns)
+        except Rejected as rejected:
+            self._rejections.count(rejected.reason)
+            LOG.debug("agent %d: %s", self._agent_id, rejected)
+            return
         self._on_packet(key, payload, arrived_s, unix_ns)
 
     def _on_presence(self, agent_id: int, alive: bool) -> None:

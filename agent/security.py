@@ -1,14 +1,14 @@
 """What a security profile promises, whether all of it is there, and the credentials that go with it.
 
-=============  ===========  =======================  =============  ==========================================
-profile        links        packets                  payloads       MAVLink (``mavlink.signing = "auto"``)
-=============  ===========  =======================  =============  ==========================================
-lab            plain        signed, or unsigned      as asked for   unsigned
-field          mutual TLS,  signed                   as asked for   signed on all links but serial ones
-               access                                (TLS already)
-               control
-lossy_field    plain        signed                   as asked for   signed on all links but serial ones
-=============  ===========  =======================  =============  ==========================================
+===========  ===========  ===================  =============  ==============  ====================================
+profile      links        packets              payloads       UWB frames      MAVLink (``mavlink.signing = "auto"``)
+===========  ===========  ===================  =============  ==============  ====================================
+lab          plain        signed, or unsigned  as asked for   as they come    unsigned
+field        mutual TLS,  signed               as asked for   with the        signed on all links but serial ones
+             access                            (TLS already)  drone's
+             control                                          certificate
+lossy_field  plain        signed               as asked for   sealed          signed on all links but serial ones
+===========  ===========  ===================  =============  ==============  ====================================
 
 The checks read key files and nothing else: no socket, no clock. ``base`` is the folder of the configuration file,
 ``unix_s`` the wall clock.
@@ -27,13 +27,15 @@ from agent.endpoints import Endpoint, LinkKind, parse_endpoint
 from agent.errors import SecurityError
 from agent.mavlink_signing import LinkSigning
 from agent.mavlink_stamps import StampFile
+from transport.addresses import SECURE_LINKS
 from transport.auth import UNSIGNED, Signing, Trust
 from transport.certificate_files import Member, authority_key_path, authority_path
 from transport.envelope import SALT_BYTES, Envelopes
-from transport.errors import KeyFileError
+from transport.errors import KeyFileError, UnwritableError
 from transport.keys import load_public_keys, load_secret, load_trust, next_boot, secret_path
-from transport.session_settings import SECURE_LINKS, SessionSettings, TlsSettings
+from transport.session_settings import SessionSettings, TlsSettings
 from transport.shared_keys import load_group_keys, load_mavlink_key
+from transport.uwb_seal import UwbSeal
 
 WARN_BEFORE_S = 14 * 86_400.0
 """Certificates that expire within this are warned of."""
@@ -41,12 +43,16 @@ WARN_BEFORE_S = 14 * 86_400.0
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """What an agent goes on the air with; ``envelopes`` is ``None`` where nothing is encrypted."""
+    """What an agent goes on the air with.
+
+    ``envelopes`` is ``None`` where nothing is encrypted, ``uwb_seal`` where UWB frames are taken as they come.
+    """
 
     signing: Signing
     trust: Trust
     boot: int
     envelopes: Envelopes | None
+    uwb_seal: UwbSeal | None = None
 
 
 def key_folder(config: FleetConfig, base: Path) -> Path:
@@ -58,6 +64,30 @@ def state_folder(config: FleetConfig, base: Path) -> Path:
     """Where a daemon keeps what must outlive a restart."""
     security = config.security
     return base / (security.keys if security.state is None else security.state)
+
+
+def ready_state_folder(config: FleetConfig, base: Path) -> None:
+    """Make the folder of ``security.state`` (mode 0700) where only itself is missing.
+
+    Raises `KeyFileError`, `UnwritableError` if the disk refuses.
+    """
+    folder = state_folder(config, base)
+    if config.security.state is None or os.path.isdir(folder):
+        return
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+    except FileNotFoundError:
+        raise KeyFileError(f"security.state: {folder.parent}, in which it would be made, is not there") from None
+    except OSError as error:
+        raise UnwritableError(f"security.state: {folder} cannot be made: {error.strerror}") from None
+
+
+def state_warnings(config: FleetConfig, base: Path) -> list[str]:
+    """A line if ``security.state`` is a folder that `ready_state_folder` could not make on this machine."""
+    folder = state_folder(config, base)
+    if config.security.state is None or os.path.isdir(folder) or os.path.isdir(folder.parent):
+        return []
+    return [f"security.state: neither {folder} nor the folder it would be made in is on this machine"]
 
 
 def is_field(config: FleetConfig) -> bool:
@@ -215,6 +245,7 @@ def mavlink_signing(config: FleetConfig, agent_id: int, base: Path, *, unix_s: f
     if not signs_mavlink(config, agent_id):
         return None
     key = load_mavlink_key(key_folder(config, base), agent_id)
+    ready_state_folder(config, base)
     return LinkSigning(key, unix_s=unix_s, stamps=stamp_file(config, agent_id, base).load())
 
 
@@ -260,11 +291,19 @@ def credentials(config: FleetConfig, agent_id: int, base: Path, *, unix_s: float
     if config.security.mode == "unsigned":
         return Credentials(UNSIGNED, UNSIGNED, int(unix_s), None)
     folder = key_folder(config, base)
+    ready_state_folder(config, base)
     boot = next_boot(state_folder(config, base) / f"agent_{agent_id:03d}.boot", unix_s)
     envelopes = None
     if config.security.encrypt:
         envelopes = Envelopes(load_group_keys(folder), agent_id, boot=boot, salt=salt)
-    return Credentials(load_secret(folder, agent_id), load_trust(folder, config.ids), boot, envelopes)
+    secret = load_secret(folder, agent_id)
+    seal = UwbSeal(secret) if seals_uwb(config) else None
+    return Credentials(secret, load_trust(folder, config.ids), boot, envelopes, seal)
+
+
+def seals_uwb(config: FleetConfig) -> bool:
+    """Whether UWB frames have to be sealed by the drone's own driver: in a field profile whose links are plain."""
+    return config.security.profile == "lossy_field"
 
 
 def new_salt() -> bytes:
@@ -310,5 +349,10 @@ def observer_session(config: FleetConfig, base: Path) -> SessionSettings:
 
 
 def driver_session(config: FleetConfig, agent_id: int, base: Path) -> SessionSettings:
-    """The session of a UWB driver beside an agent, under whose id it is to be opened: dials that agent."""
-    return SessionSettings(connect=config.device_endpoints(agent_id), tls=tls_settings(config, agent_id, base))
+    """The session of a UWB driver beside an agent, under whose id it is to be opened: dials that agent.
+
+    Raises `KeyFileError` where frames have to be sealed and the agent's signing key cannot be read.
+    """
+    seal = UwbSeal(load_secret(key_folder(config, base), agent_id)) if seals_uwb(config) else None
+    tls = tls_settings(config, agent_id, base)
+    return SessionSettings(connect=config.device_endpoints(agent_id), tls=tls, uwb_seal=seal)

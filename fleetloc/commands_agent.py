@@ -41,8 +41,12 @@ def agent(
     """Run the daemon of one drone until SIGTERM or SIGINT.
 
     Exit codes: 0 stopped, 1 a fault of the program, 2 wrong usage, 3 configuration, 4 autopilot's link, 5 keys,
-    6 session with the other agents, 7 no autopilot appeared, 8 record.
+    6 session with the other agents, 7 no autopilot appeared, 8 record, 9 what has to outlive a restart (disk full).
     """
+    import logging
+    import time
+
+    from agent.clock import require_epoch
     from agent.config import load_config
     from agent.daemon import run
     from agent.errors import ConfigError, RecordError
@@ -59,6 +63,7 @@ def agent(
         settings.append(f"record.directory={out}")
     try:
         fleet = load_config(config, settings, profiles or ())
+        unset = require_epoch(fleet.fleet, str(config), unix_s=time.time())
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.CONFIG) from error
     try:
@@ -70,6 +75,8 @@ def agent(
         raise NotStarted(str(error), ExitCode.CONFIG) from error
     except KeyFileError as error:
         raise NotStarted(str(error), ExitCode.KEYS) from error
+    if unset is not None:
+        logging.getLogger("fleetloc.agent").warning("agent %d: %s; nothing is sent until it is set", agent_id, unset)
     announce()
     if fleet.record.directory is not None:
         try:

@@ -34,8 +34,9 @@ def check(
     """
     import time
 
+    from agent.clock import require_epoch
     from agent.config import dump, load_config
-    from agent.security import agents_here, expiry_warnings, security_faults
+    from agent.security import agents_here, expiry_warnings, security_faults, state_warnings
     from fleetloc.errors import InputError
     from sim_bridge.scenario_config import scenario_from_config
 
@@ -47,6 +48,7 @@ def check(
     if agent_id is not None and agent_id not in fleet.ids:
         raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
     base, unix_s = config.parent, time.time()
+    warnings = [line for line in (require_epoch(fleet.fleet, str(config), unix_s=unix_s),) if line is not None]
     here = (agent_id,) if agent_id is not None else agents_here(fleet, base)
     faults = dict.fromkeys(line for one in here for line in security_faults(fleet, one, base, unix_s=unix_s))
     if faults:
@@ -54,7 +56,9 @@ def check(
             typer.echo(line, err=True)
         expected = f"all that profile {fleet.security.profile} promises"
         raise InputError(str(config), "security", expected, f"{len(faults)} things missing, see above")
-    for line in dict.fromkeys(line for one in here for line in expiry_warnings(fleet, one, base, unix_s=unix_s)):
+    for one in here:
+        warnings += expiry_warnings(fleet, one, base, unix_s=unix_s)
+    for line in dict.fromkeys([*warnings, *state_warnings(fleet, base)]):
         typer.echo(f"warning: {line}", err=True)
     typer.echo(f"{config}: fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
     for table in fleet.agents:

@@ -79,8 +79,7 @@ def _prepared(
 
     Checks before anything starts: the scenario, and for a live run what the security profile promises.
     """
-    import msgspec
-
+    from agent.clock import require_epoch
     from agent.config import dump, load_config
     from agent.security import require
     from fleetloc import run_files
@@ -88,18 +87,13 @@ def _prepared(
 
     fleet = load_config(config, settings, profiles)
     scenario_from_config(fleet)
-    # absolute, so that a daemon can be restarted from anywhere with the configuration in the folder
     folder = (out or Path("out") / fleet.fleet.name).resolve()
-    keys = (config.parent / fleet.security.keys).resolve()
+    run_files.refuse_inputs(folder, (config, *profiles))
     if live:
+        require_epoch(fleet.fleet, str(config), unix_s=time.time())
         for agent_id in fleet.ids:
             require(fleet, agent_id, config.parent, unix_s=time.time())
-    replace = msgspec.structs.replace
-    fleet = replace(
-        fleet,
-        record=replace(fleet.record, directory=str(folder)),
-        security=replace(fleet.security, keys=str(keys)),
-    )
+    fleet = run_files.in_folder(fleet, config.parent, folder)
     run_files.clear(folder)
     (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
     return fleet

@@ -103,24 +103,23 @@ def _prepared(
 
 def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
     """Put the effective configuration into the run's folder, for all processes of the run; that folder."""
-    import msgspec
+    import time
 
+    from agent.clock import require_epoch
     from agent.config import dump
+    from agent.security import key_folder
     from fleetloc import run_files
     from transport.keys import load_secret, load_trust
 
     folder = (out or Path("out") / fleet.fleet.name).resolve()
-    keys = (file.parent / fleet.security.keys).resolve()
+    run_files.refuse_inputs(folder, (file, *([fleet.sitl.mission] if fleet.sitl.mission else [])))
+    require_epoch(fleet.fleet, str(file), unix_s=time.time())
+    keys = key_folder(fleet, file.parent)
     if fleet.security.mode == "signed":
         load_trust(keys, fleet.ids)
         for agent_id in fleet.ids:
             load_secret(keys, agent_id)
-    replace = msgspec.structs.replace
-    fleet = replace(
-        fleet,
-        record=replace(fleet.record, directory=str(folder)),
-        security=replace(fleet.security, keys=str(keys)),
-    )
+    fleet = run_files.in_folder(fleet, file.parent, folder)
     run_files.clear(folder)
     (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
     return folder
@@ -166,7 +165,10 @@ def sitl_bridge(
         out.mkdir(parents=True, exist_ok=True)
     lines = LineWriter()
     truth_file = None if out is None else out / TRUTH
-    report = asyncio.run(bridge(fleet, truth_file=truth_file, on_progress=lines.progress, on_step=lines.step))
+    flown = bridge(
+        fleet, truth_file=truth_file, on_progress=lines.progress, on_step=lines.step, base=config.parent
+    )
+    report = asyncio.run(flown)
     if out is not None:
         write_json(out / SIMULATOR_JSON, dataclasses.asdict(report))
 

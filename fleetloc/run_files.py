@@ -19,9 +19,14 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
+import msgspec
+
+from agent.config_tables import FleetConfig
 from agent.recording import SUFFIX
+from fleetloc.errors import InputError
 
 CONFIG, TRUTH, REPORT_JSON, REPORT_HTML = "fleet.toml", "truth.npz", "report.json", "report.html"
 SIMULATOR_LOG, SIMULATOR_JSON = "simulator.log", "simulator.json"
@@ -63,16 +68,51 @@ def records(directory: Path, agent_id: int) -> list[Path]:
     return [*earlier, *([last] if last.exists() else [])]
 
 
+def in_folder(config: FleetConfig, base: Path, directory: Path) -> FleetConfig:
+    """The configuration of a run as its folder holds it: paths absolute, so that a daemon can be restarted anywhere.
+
+    ``base`` is the folder of the configuration file, which the key and state folders are relative to.
+    """
+    replace, security = msgspec.structs.replace, config.security
+    absolute = {"keys": str((base / security.keys).resolve())}
+    if security.state is not None:
+        absolute["state"] = str((base / security.state).resolve())
+    return replace(
+        config,
+        record=replace(config.record, directory=str(directory)),
+        security=replace(security, **absolute),
+    )
+
+
+def refuse_inputs(directory: Path, inputs: Iterable[Path | str], also: re.Pattern[str] | None = None) -> None:
+    """Refuse a folder in which `clear` would remove what the run is to read; raises `InputError`.
+
+    ``also`` matches the names of further files that the command removes or writes there. Inputs that are no files
+    are passed over.
+    """
+    files = [path for path in map(Path, inputs) if path.is_file()]
+    for left in _left_in(directory, also):
+        if any(left.samefile(path) for path in files):
+            expected = "another folder: files of this name are a run's own, and are removed when one begins"
+            raise InputError("--out", str(directory), expected, f"an input of this run, {left.name}")
+
+
 def clear(directory: Path) -> None:
     """Make the folder, and remove what an earlier run left in it; nothing else is touched.
 
-    Raises `OSError` if the folder refuses.
+    Ask `refuse_inputs` before. Raises `OSError` if the folder refuses.
     """
     directory.mkdir(parents=True, exist_ok=True)
+    for path in _left_in(directory):
+        path.unlink()
+
+
+def _left_in(directory: Path, also: re.Pattern[str] | None = None) -> Iterator[Path]:
+    """The files in a folder whose names are those of a run."""
     named = {CONFIG, TRUTH, REPORT_JSON, REPORT_HTML, SIMULATOR_LOG, SIMULATOR_JSON}
-    for path in directory.iterdir():
-        if path.name in named or _OF_A_RUN.fullmatch(path.name):
-            path.unlink()
+    for path in directory.iterdir() if directory.is_dir() else ():
+        if path.name in named or _OF_A_RUN.fullmatch(path.name) or (also and also.fullmatch(path.name)):
+            yield path
 
 
 def _numbered(path: Path, number: int) -> Path:

@@ -13,16 +13,14 @@ from pathlib import Path
 
 from agent.config_tables import FleetConfig
 from agent.endpoints import Endpoint, parse_endpoint
-from agent.security import driver_session, simulated_mavlink_keys
+from agent.security import simulated_mavlink_keys
+from sim_bridge.range_sessions import open_range_sessions
 from sim_bridge.scenario import Scenario
 from sim_bridge.scenario_config import scenario_from_config
 from sim_bridge.simulation import Outputs, Simulation, aligned_start
 from sim_bridge.udp_autopilot import AutopilotPort, open_port
 from sim_bridge.uwb_frames import UwbDrivers
-from transport.errors import TransportError
-from transport.session import Handlers, Session, open_session
 from transport.session_settings import SessionSettings
-from transport.streams import Stream
 
 LOG = logging.getLogger(__name__)
 LATE_S = 0.1
@@ -159,51 +157,6 @@ def stop_signals(stop: asyncio.Event) -> Iterator[None]:
     finally:
         for number in STOP_SIGNALS:
             loop.remove_signal_handler(number)
-
-
-def range_session_settings(config: FleetConfig) -> SessionSettings:
-    """Zenoh settings of the UWB drivers' session on plain links: dials every agent, listens nowhere."""
-    endpoints = (endpoint for agent in config.ids for endpoint in config.device_endpoints(agent))
-    return SessionSettings(connect=tuple(dict.fromkeys(endpoints)))
-
-
-class RangeSessions:
-    """The UWB drivers' sessions with their agents, which they dial.
-
-    One session for all, as long as nobody asks who it is; with certificates one for each agent, under its own.
-    """
-
-    def __init__(self, sessions: dict[int, Session]) -> None:
-        self._sessions = sessions
-
-    def publish(self, observer: int, payload: bytes) -> bool:
-        """Put ranges that an agent measured on its key; whether they were taken."""
-        return self._sessions[observer].publish(Stream.UWB, payload, agent_id=observer)
-
-    async def close(self) -> None:
-        """Leave."""
-        for session in dict.fromkeys(self._sessions.values()):
-            await session.close()
-
-
-async def open_range_sessions(
-    config: FleetConfig, base: Path, settings: SessionSettings | None = None
-) -> RangeSessions:
-    """The sessions of all UWB drivers, or with ``settings`` one of these; raises `SessionError`."""
-    fleet, handlers = config.fleet.name, Handlers(lambda _key, _payload, _arrived_s: None)
-    if settings is not None or config.security.profile != "field":
-        settings = settings or range_session_settings(config)
-        session = await open_session(settings, fleet, None, config.ids, handlers)
-        return RangeSessions(dict.fromkeys(config.ids, session))
-    sessions: dict[int, Session] = {}
-    try:
-        for agent_id in config.ids:
-            own = driver_session(config, agent_id, base)
-            sessions[agent_id] = await open_session(own, fleet, agent_id, config.ids, handlers)
-    except TransportError:
-        await RangeSessions(sessions).close()
-        raise
-    return RangeSessions(sessions)
 
 
 async def simulate(

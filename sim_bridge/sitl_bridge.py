@@ -14,15 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config_tables import FleetConfig
-from sim_bridge.simulator import PublishRanges, range_session_settings, stop_signals
+from sim_bridge.range_sessions import open_range_sessions
+from sim_bridge.simulator import PublishRanges, stop_signals
 from sim_bridge.sitl_session import TimedTruth
 from sim_bridge.sitl_setup import vehicle_links
 from sim_bridge.sitl_vehicle import SitlVehicle, VehicleReport
 from sim_bridge.sitl_world import SitlWorld
 from sim_bridge.truth import TruthError
 from sim_bridge.uwb_frames import UwbDrivers
-from transport.session import Handlers, open_session
-from transport.streams import Stream
 
 LOG = logging.getLogger(__name__)
 STEP_S = 0.01
@@ -204,21 +203,19 @@ async def bridge(
     stop: asyncio.Event | None = None,
     on_progress: OnProgress = lambda _progress: None,
     on_step: OnStep | None = None,
+    base: Path = Path(),
 ) -> BridgeReport:
     """Run the bridge of a fleet until ``stop``, SIGTERM or SIGINT, and then write the truth.
 
-    Raises `ConfigError`, `ScenarioError`, `PortError`, `LinkError` or `SessionError` before anything is relayed,
-    `SimulatorAbsent` for a simulator that does not come.
+    ``base`` is the folder that the key folder is relative to. Raises `ConfigError`, `ScenarioError`, `PortError`,
+    `LinkError`, `KeyFileError` or `SessionError` before anything is relayed, `SimulatorAbsent` for a simulator that
+    does not come.
     """
     world = SitlWorld(config, time.time() - time.monotonic())
     stop = stop or asyncio.Event()
-    settings = range_session_settings(config)
-    handlers = Handlers(lambda _key, _payload, _arrived_s: None)
-    session = await open_session(settings, config.fleet.name, None, config.ids, handlers)
+    sessions = await open_range_sessions(config, base)
     try:
-        sitl = SitlBridge(
-            config, world, lambda observer, payload: session.publish(Stream.UWB, payload, agent_id=observer)
-        )
+        sitl = SitlBridge(config, world, sessions.publish)
         try:
             await sitl.open()
             with stop_signals(stop):
@@ -226,7 +223,7 @@ async def bridge(
         finally:
             await sitl.close()
     finally:
-        await session.close()
+        await sessions.close()
         _save(world, truth_file)
 
 

@@ -54,7 +54,8 @@ def require_client() -> None:
         import mavsdk  # noqa: F401
     except ImportError as error:
         raise ClientMissing(
-            "flying a mission needs the MAVSDK client, expected the package mavsdk: install fleetloc[sitl]"
+            "flying a mission needs the MAVSDK client, expected the package mavsdk: "
+            "pip install '.[sitl]' in the checkout of fleetloc"
         ) from error
 
 

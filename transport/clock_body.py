@@ -1,7 +1,7 @@
 """The clock stream: a query with the asker's time, answered with the two times of the answerer.
 
 The question is 8 bytes (``t1`` ns); the answer is a sealed packet whose body is ``t1 t2 t3`` (i64 ns). The
-echoed ``t1`` ties the answer to the question, the seal to its sender.
+echoed ``t1`` ties the answer to the question (`check_echo`), the seal to its sender.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import struct
 from dataclasses import dataclass
 
 from transport.errors import Reason, Rejected
+from transport.header import HEADER_BYTES
 
 _QUESTION = struct.Struct("<q")
 _ANSWER = struct.Struct("<qqq")
@@ -49,3 +50,13 @@ def decode_clock_answer(body: bytes) -> ClockAnswer:
     if answered_ns < received_ns:
         raise Rejected(Reason.OUT_OF_RANGE, "clock answer sent before it was asked")
     return ClockAnswer(asked_ns, received_ns, answered_ns)
+
+
+def check_echo(packet: bytes, asked_ns: int) -> None:
+    """Raises `Rejected` if a sealed packet with an answer is one to another question than that of ``asked_ns``.
+
+    Nothing else is looked at: `transport.opening` does that next, and refuses an echo that somebody changed.
+    """
+    echo = packet[HEADER_BYTES : HEADER_BYTES + _QUESTION.size]
+    if echo != _QUESTION.pack(asked_ns):
+        raise Rejected(Reason.WRONG_ANSWER, f"clock answer of {len(packet)} bytes to a question that we did not ask")

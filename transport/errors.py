@@ -6,6 +6,7 @@
     ├── Rejected        a packet from outside is not accepted; carries a Reason, never stops anything
     ├── EncodeError     a value of our own cannot be sent (NaN, wrong shape): a fault of the caller
     ├── KeyFileError    a key file is missing, malformed or readable by others
+    │   └── UnwritableError   a key file, or the number of the last start, cannot be written: a full disk
     ├── SettingsError   a setting is contradictory or unsafe
     └── SessionError    the Zenoh session cannot be opened
 """
@@ -45,6 +46,8 @@ class Reason(StrEnum):
     """Older than the replay window, or of an earlier start of its sender."""
     STALE = "stale"
     """Its clock is too far from ours."""
+    WRONG_ANSWER = "wrong_answer"
+    """A clock's answer to another question than ours."""
     MALFORMED = "malformed"
     UNKNOWN_AGENT = "unknown_agent"
     """The body speaks of an agent that is not in the fleet."""
@@ -85,6 +88,10 @@ class EncodeError(TransportError, ValueError):
 
 class KeyFileError(TransportError):
     """A key file cannot be used; the message names the file, the fault and the remedy."""
+
+
+class UnwritableError(KeyFileError):
+    """A file in the key or state folder cannot be written: the disk is full, say. Trying again may help."""
 
 
 class SettingsError(TransportError, ValueError):

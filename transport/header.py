@@ -24,30 +24,28 @@ MAX_DATAGRAM_BODY_BYTES = MAX_DATAGRAM_BYTES - HEADER_BYTES - SIGNATURE_BYTES
 
 MAGIC = b"CL"
 VERSION = 1
+MAX_TICK = 2**32 - 1
 FLAG_FLOAT64 = 0b1
 """The body's numbers are float64 instead of float32."""
 KNOWN_FLAGS = FLAG_FLOAT64
 
 
 class Kind(IntEnum):
-    """What the body is; one kind for each stream that carries packets."""
+    """What the body is; one kind for each stream that carries packets. 4 is not used."""
 
     MEAS = 1
     INFO = 2
     EST = 3
-    CARD = 4
     CLOCK = 5
     DIAG = 6
 
 
 STREAM_OF_KIND = {kind: Stream[kind.name] for kind in Kind}
-KIND_OF_STREAM = {stream: kind for kind, stream in STREAM_OF_KIND.items()}
 
 MAX_BODY_BYTES = {
     Kind.MEAS: MAX_DATAGRAM_BODY_BYTES,
     Kind.INFO: MAX_DATAGRAM_BODY_BYTES,
     Kind.EST: 64 * 1024,
-    Kind.CARD: 2048,
     Kind.CLOCK: 64,
     Kind.DIAG: 16 * 1024,
 }

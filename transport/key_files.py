@@ -5,11 +5,12 @@ Asked for with `os.path`, which answers "no" where `Path` raises for what we may
 
 from __future__ import annotations
 
+import contextlib
 import os
 import stat
 from pathlib import Path
 
-from transport.errors import KeyFileError
+from transport.errors import KeyFileError, UnwritableError
 
 PRIVATE, PUBLIC = 0o600, 0o644
 """Permissions of secrets and of what everybody may read."""
@@ -18,7 +19,7 @@ OTHERS, OTHERS_WRITE = 0o077, 0o022
 
 
 def write_text(path: Path, text: str, mode: int) -> None:
-    """Replace a file as a whole, with its mode from the first moment on; raises `KeyFileError`."""
+    """Replace a file as a whole, with its mode from the first moment on; raises `UnwritableError`."""
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         temporary.unlink(missing_ok=True)
@@ -30,7 +31,9 @@ def write_text(path: Path, text: str, mode: int) -> None:
             os.fsync(descriptor)
         os.replace(temporary, path)
     except OSError as error:
-        raise KeyFileError(f"{path}: cannot be written: {error.strerror}") from None
+        with contextlib.suppress(OSError):  # what is wrong is said below
+            temporary.unlink(missing_ok=True)
+        raise UnwritableError(f"{path}: cannot be written: {error.strerror}") from None
 
 
 def check_directory(directory: Path) -> None:

@@ -126,7 +126,7 @@ def next_boot(path: Path, unix_s: float) -> int:
     """The number of this start, greater than that of every earlier one, kept in ``path``.
 
     The greater of the last number plus one and the time: a clock that went back and a lost file are both
-    survived, though not both at once. Raises `KeyFileError` if the file cannot be read or written.
+    survived, though not both at once. Raises `KeyFileError`, `UnwritableError` if the file cannot be written.
     """
     last = 0
     if os.path.exists(path):

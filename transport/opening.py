@@ -23,7 +23,7 @@ from transport.measurement_body import decode_measurements
 from transport.peers import PeerTable
 from transport.reassembly import Reassembler
 from transport.replay import ReplayGuard
-from transport.report_body import decode_card, decode_diagnostics
+from transport.report_body import decode_diagnostics
 from transport.sealing import Message
 from transport.streams import check_agent_id, check_fleet_name, parse_key
 
@@ -145,8 +145,8 @@ class Opener:
                 return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
             case Kind.CLOCK:
                 return decode_clock_answer(body)
-            case Kind.CARD | Kind.DIAG:
-                report = decode_card(body) if header.kind is Kind.CARD else decode_diagnostics(body)
+            case Kind.DIAG:
+                report = decode_diagnostics(body)
                 if report.agent_id != h.sender:
                     raise Rejected(Reason.OUT_OF_RANGE, f"{h.kind.name} of agent {report.agent_id}")
                 return report

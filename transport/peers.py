@@ -1,4 +1,4 @@
-"""What is known of each neighbour's link: received, lost, late, refused, age, clock offset; sans-I/O."""
+"""What is known of each neighbour's link: received, lost, refused, age, clock offset; sans-I/O."""
 
 from __future__ import annotations
 
@@ -63,11 +63,10 @@ class _Numbers:
 
 
 class Peer:
-    """Counters of one neighbour. ``late`` and ``clock`` are fed by the agent."""
+    """Counters of one neighbour. ``clock`` is fed by the agent."""
 
     def __init__(self) -> None:
         self.received = 0
-        self.late = 0
         self.restarts = 0
         self.rejections = RejectionCounter()
         self.clock = ClockFilter()
@@ -111,7 +110,6 @@ class Peer:
         counters = {
             "received": self.received,
             "lost": self.lost,
-            "late": self.late,
             "restarts": self.restarts,
             "rejected": self.rejections.total,
         }
@@ -144,11 +142,6 @@ class PeerTable:
         """Note packets refused under an agent's key (whoever really sent them)."""
         peer = None if agent_id is None else self._peers.get(agent_id)
         (self.unattributed if peer is None else peer.rejections).count(reason, times)
-
-    def heard_within(self, age_s: float, now: float) -> frozenset[int]:
-        """Neighbours with a packet accepted in the last ``age_s``."""
-        ages = {agent_id: peer.age_s(now) for agent_id, peer in self._peers.items()}
-        return frozenset(agent_id for agent_id, age in ages.items() if age is not None and age <= age_s)
 
     def rejections(self) -> dict[str, int]:
         """All refused packets by reason."""

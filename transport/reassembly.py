@@ -41,11 +41,6 @@ class Reassembler:
         self._expiry_s = expiry_s
         self._sets: dict[int, OrderedDict[Key, _PartialSet]] = {}
 
-    @property
-    def pending(self) -> int:
-        """Incomplete sets held, of all senders."""
-        return sum(len(sets) for sets in self._sets.values())
-
     def add(
         self, sender: int, tick: int, round_: int, part: InformationPart, now: float
     ) -> Information | None:

@@ -19,10 +19,10 @@ from transport.header import (
 )
 from transport.information_body import Information, encode_information, float32_suffices
 from transport.measurement_body import Measurements, encode_measurements
-from transport.report_body import Card, Diagnostics, encode_card, encode_diagnostics
+from transport.report_body import Diagnostics, encode_diagnostics
 from transport.streams import Stream, check_agent_id, key_expression
 
-Message = Measurements | Information | FleetEstimate | Card | Diagnostics | ClockAnswer
+Message = Measurements | Information | FleetEstimate | Diagnostics | ClockAnswer
 """Everything that travels in a packet."""
 
 
@@ -85,8 +85,6 @@ class Sealer:
                 data = encode_estimate(message, double=bool(double))
                 flags = FLAG_FLOAT64 if double else 0
                 return [_Body(Kind.EST, data, message.tick, n=len(message.agents), flags=flags)]
-            case Card():
-                return [_Body(Kind.CARD, encode_card(message))]
             case Diagnostics():
                 return [_Body(Kind.DIAG, encode_diagnostics(message))]
             case ClockAnswer():

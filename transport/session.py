@@ -27,6 +27,7 @@ from transport.streams import (
     presence_pattern,
     self_contained,
 )
+from transport.uwb_seal import UwbSeal
 
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
 """Zenoh's errors name places in its own source, which help nobody here."""
@@ -48,11 +49,10 @@ QUALITY = {
     Stream.MEAS: Quality(zenoh.Priority.INTERACTIVE_LOW, True, _RELIABLE),
     Stream.INFO: Quality(zenoh.Priority.INTERACTIVE_HIGH, True, _BEST_EFFORT),
     Stream.EST: Quality(zenoh.Priority.DATA_LOW, False, _RELIABLE),
-    Stream.CARD: Quality(zenoh.Priority.DATA, False, _RELIABLE),
     Stream.DIAG: Quality(zenoh.Priority.BACKGROUND, False, _RELIABLE),
     Stream.UWB: Quality(zenoh.Priority.DATA_HIGH, True, _BEST_EFFORT),
 }
-OWN_STREAMS = (Stream.MEAS, Stream.INFO, Stream.EST, Stream.CARD, Stream.DIAG)
+OWN_STREAMS = (Stream.MEAS, Stream.INFO, Stream.EST, Stream.DIAG)
 
 SampleHandler = Callable[[str, bytes, float], None]
 """(key expression, payload, arrival on the clock of `asyncio` in s)."""
@@ -86,6 +86,7 @@ class Session:
         inbox_packets: int,
         *,
         over_datagrams: bool = False,
+        uwb_seal: UwbSeal | None = None,
     ) -> None:
         self._session = session
         self._fleet = fleet
@@ -95,6 +96,7 @@ class Session:
         self._inbox: deque[tuple[Callable[..., None], tuple[Any, ...]]] = deque()
         self._inbox_packets = inbox_packets
         self._over_datagrams = over_datagrams
+        self._uwb_seal = uwb_seal
         self._lock = threading.Lock()
         self._draining = False
         self._closed = False
@@ -151,11 +153,14 @@ class Session:
     def publish(self, stream: Stream, data: bytes, *, agent_id: int | None = None) -> bool:
         """Put bytes on an own stream, or (a UWB driver) on that of ``agent_id``; never blocks.
 
-        False, and counted in ``failed``, if the session could not take it.
+        UWB frames are sealed where the settings have a seal. False, and counted in ``failed``, if the session could
+        not take it.
         """
         owner = self._agent_id if agent_id is None else agent_id
         if owner is None:
             raise ValueError("an observer has no streams of its own; name the agent")
+        if stream is Stream.UWB and self._uwb_seal is not None:
+            data = self._uwb_seal.close(key_expression(self._fleet, owner, stream), data)
         try:
             self._publisher(owner, stream).put(data)
         except zenoh.ZError:
@@ -321,4 +326,12 @@ async def open_session(
             f"Zenoh session listening on {where}: {cause}; is the port taken, or the address not ours?"
         ) from None
     datagrams = any(endpoint.startswith("udp/") for endpoint in (*settings.listen, *settings.connect))
-    return Session(session, fleet, agent_id, handlers, settings.inbox_packets, over_datagrams=datagrams)
+    return Session(
+        session,
+        fleet,
+        agent_id,
+        handlers,
+        settings.inbox_packets,
+        over_datagrams=datagrams,
+        uwb_seal=settings.uwb_seal,
+    )

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import msgspec
 import zenoh
 
+from transport.addresses import ALL_LINKS, SECURE_LINKS, endpoint_fault
 from transport.errors import SettingsError
 from transport.header import MAX_PACKET_BYTES
 from transport.streams import (
@@ -24,13 +25,11 @@ from transport.streams import (
     key_expression,
     observer_name,
 )
+from transport.uwb_seal import UwbSeal
 
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=600_000)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
-SECURE_LINKS = ("tls", "quic")
-PLAIN_LINKS = ("tcp", "udp")
-MAX_PORT = 65535
 
 
 class TlsSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -82,33 +81,24 @@ class SessionSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     inbox_packets: Count = 4096
     """Packets received but not yet looked at; what comes beyond is shed and counted."""
 
+    uwb_seal: UwbSeal | None = None
+    """Of a UWB driver: closes what is put on the ``uwb`` stream; absent = frames go as they are."""
+
     def __post_init__(self) -> None:
-        for endpoint in (*self.listen, *self.connect):
-            link, _, address = endpoint.partition("/")
-            allowed = SECURE_LINKS if self.tls else SECURE_LINKS + PLAIN_LINKS
-            if link not in allowed or ":" not in address:
-                expected = ", ".join(f"{name}/HOST:PORT" for name in allowed)
-                raise SettingsError(f"endpoint {endpoint!r}: expected one of {expected}")
-            if link in SECURE_LINKS and self.tls is None:
-                raise SettingsError(f"endpoint {endpoint!r}: a {link} link needs the tls settings")
+        allowed = SECURE_LINKS if self.tls else ALL_LINKS
+        for lowest, endpoints in enumerate((self.listen, self.connect)):
+            for endpoint in endpoints:
+                fault = endpoint_fault(endpoint, allowed, lowest=lowest)
+                if fault is not None:
+                    raise SettingsError(f"endpoint {endpoint!r}: expected {fault}")
+                link = endpoint.partition("/")[0]
+                if link in SECURE_LINKS and self.tls is None:
+                    raise SettingsError(f"endpoint {endpoint!r}: a {link} link needs the tls settings")
 
     @property
     def multilink(self) -> bool:
         """Whether endpoints name a reliability, so that a neighbour has a stream and a datagram link."""
         return any("rel=" in endpoint for endpoint in (*self.listen, *self.connect))
-
-
-def loopback_settings(agent_id: int, neighbours: Iterable[int], base_port: int) -> SessionSettings:
-    """Settings on one machine: agent i listens on ``base_port + i`` and dials its lower neighbours."""
-
-    def endpoint(other: int) -> str:
-        port = base_port + check_agent_id(other)
-        if not 1 <= port <= MAX_PORT:
-            raise SettingsError(f"base port {base_port}: agent {other} gets port {port}, over {MAX_PORT}")
-        return f"tcp/127.0.0.1:{port}"
-
-    dialled = tuple(endpoint(other) for other in sorted(set(neighbours)) if other < agent_id)
-    return SessionSettings(listen=(endpoint(agent_id),), connect=dialled)
 
 
 def zenoh_config(

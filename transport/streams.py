@@ -30,8 +30,6 @@ class Stream(StrEnum):
     """Ranges from a UWB driver process to the agent of the same id (``uwb-range/1``, no packet header)."""
     ALIVE = "alive"
     """Liveliness token."""
-    CARD = "card"
-    """What the agent is; sent on change and whenever a neighbour appears."""
     CLOCK = "clock"
     """Queryable for the clock offset."""
     DIAG = "diag"

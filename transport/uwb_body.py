@@ -16,8 +16,6 @@ import msgspec
 
 from transport.errors import EncodeError, Reason, Rejected, RejectionCounter
 
-UWB_ENCODING_BINARY = "application/x-coop-uwb1"
-UWB_ENCODING_JSON = "application/json"
 MAX_RANGES = 64
 MAX_RANGE_M = 2000.0
 MAX_AGE_S = 1.0

@@ -69,7 +69,7 @@ def require_casadi() -> Any:
     """The casadi module; raises `EnvironmentFault` where it is not installed."""
     if importlib.util.find_spec("casadi") is None:
         raise EnvironmentFault(
-            "casadi is not installed: bench speed needs it, pip install 'fleetloc[compare]'"
+            "casadi is not installed: bench speed needs it: pip install '.[compare]' in the checkout of fleetloc"
         )
     import casadi
 

@@ -72,7 +72,6 @@ def link_view(
         level=level,
         age_s=age_s,
         loss=loss,
-        late=int(gauges.get("late", 0)),
         rejected=int(gauges.get("rejected", 0)),
         round_trip_s=gauges.get("round_trip_s"),
         clock_offset_s=gauges.get("clock_offset_s"),

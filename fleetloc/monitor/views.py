@@ -69,7 +69,6 @@ class Link(View, frozen=True):
     """Since the last packet; ``None`` if there was none, or the receiver itself is not heard."""
     loss: float | None = None
     """Share lost of the packets of the last `picture.LOSS_WINDOW_S`."""
-    late: int = 0
     rejected: int = 0
     round_trip_s: float | None = None
     clock_offset_s: float | None = None

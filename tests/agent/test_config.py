@@ -104,6 +104,17 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         ("sim.paths.1.agent=8", "sim.paths[0].agent", "ids of agents", "8"),
         ("transport.exchange_fraction=0.9", "transport.rounds_fraction", "at most 1 together", "1.3"),
         ("transport.guard_s=0.05", "transport.guard_s", "less than", "0.05"),
+        ("agents.1.mavlink=tcpout:..bad:5760", "agents[0].mavlink", "tcpout:HOST:PORT", "host '..bad' is no address"),
+        ('agents.1.listen=["tcp/127.0.0.1:99999"]', "agents[0].listen[0]", "a port 0..65535", "99999"),
+        ('agents.1.connect=["tcp/127.0.0.1:1","udp/10.0.0.2:abc"]', "agents[0].connect[1]", "a port 1..65535", "abc"),
+        ('agents.1.listen=["tcp/10.0.0.256:7447"]', "agents[0].listen[0]", "a host's name or address", "10.0.0.256"),
+        ('agents.1.listen=["http/10.0.0.2:80"]', "agents[0].listen[0]", "one of tls/HOST:PORT", "http/10.0.0.2:80"),
+        ("agents.1.radio=192.168.7.3:7447", "agents[0].radio", "without port", "192.168.7.3:7447"),
+        ("agents.1.radio=fe80::1", "agents[0].radio", "IPv6 in brackets", "fe80::1"),
+        ("metrics.base_port=65535", "metrics.base_port", "a port for each agent up to 65535", "65537 for the last"),
+        ("metrics.host=0.0.0", "metrics.host", "an address to listen on", "0.0.0"),
+        ("adsb.address=foo", "adsb.address", "udpout:HOST:PORT", "names no transport"),
+        ("estimator.kind=centralized_ekf", "estimator.kind", "a kind for agents", "centralized_ekf"),
         ("nonsense", "nonsense", "key=value with a dotted key", "'nonsense'"),
         ("fleet..name=1", "fleet..name", "key=value with a dotted key", "'fleet..name=1'"),
         ("fleet.name.x=1", "fleet.name", "a table", "'line3'"),
@@ -126,6 +137,20 @@ def test_an_outage_must_end_after_it_begins() -> None:
     document["sim"]["gps_outages"] = [{"agent": 1, "from_s": 5.0, "to_s": 5.0}]
     with pytest.raises(ConfigError, match=r"sim.gps_outages\[0\].to_s: expected later than from_s = 5.0"):
         config_from(document, "here")
+
+
+def test_the_centralised_filter_is_for_studies_and_no_agents() -> None:
+    assert load_estimator_settings(None, ["estimator.kind=centralized_ekf"]).kind == "centralized_ekf"
+    with pytest.raises(ConfigError, match=r"estimator.kind: expected a kind for agents; .* `fleetloc estimate`"):
+        load_config(LINE3, ["estimator.kind=centralized_ekf"])
+
+
+@pytest.mark.parametrize("ids", ["[]", "{ a = 1 }", "1.5"])
+def test_a_profile_whose_ids_are_none_is_refused_by_key(tmp_path: Path, ids: str) -> None:
+    profile = tmp_path / "over.toml"
+    profile.write_text(f"[[agents]]\nid = {ids}\nmavlink = 'udpin:127.0.0.1:1'\n")
+    with pytest.raises(ConfigError, match=rf"line3.toml with {profile}: agents\[0\].id: expected a whole number"):
+        load_config(LINE3, (), [profile])
 
 
 def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:

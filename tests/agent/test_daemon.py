@@ -250,6 +250,115 @@ async def test_a_stranger_on_the_mavlink_port_gets_none_of_the_autopilots_frames
     await asyncio.wait_for(running, PATIENCE_S)
 
 
+async def test_a_connection_on_which_the_autopilot_falls_silent_is_made_anew(
+    config_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its end may have vanished without a word: a connection does not tell."""
+    monkeypatch.setattr("agent.mavlink_link.REOPEN_S", 0.02)
+    monkeypatch.setattr("agent.daemon.RENEW_PERIOD_S", 0.1)
+    open_ends: list[asyncio.StreamWriter] = []
+    # GIVEN an autopilot behind TCP that says one thing on the first two connections, and then nothing
+    beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
+
+    async def serve(_reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        open_ends.append(writer)
+        if len(open_ends) <= 2:
+            writer.write(Encoder(1, 1).encode(beat))
+
+    server = await asyncio.start_server(serve, HOST, 0)
+    port = server.sockets[0].getsockname()[1]
+    link = f"agents.1.mavlink=tcpout:{HOST}:{port}"
+    config = config_of(1, "security.mode=unsigned", link, "mavlink.heartbeat_timeout_s=1.5")
+    daemon = Daemon(config, 1, make_estimator, Path())
+    running = asyncio.create_task(daemon.run())
+    # WHEN it is lost THEN it is dialled again; is it still lost, once more after a while
+    await until(lambda: daemon.core.autopilot_state == "lost", "the silence")
+    await until(lambda: daemon.core.autopilot_state == "connected", "a second connection")
+    await until(lambda: len(open_ends) >= 4, "a third and a fourth")
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    server.close()
+    for writer in open_ends:
+        writer.transport.abort()
+
+
+async def test_a_fault_of_the_core_ends_no_task_wherever_it_is_called_from(
+    config_of: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    # GIVEN a daemon whose clock questions are answered at once, from within its housekeeping
+    monkeypatch.setattr("agent.daemon.HOUSEKEEPING_PERIOD_S", 0.05)
+    daemon, asked = Daemon(config_of(1, "security.mode=unsigned"), 1, make_estimator, Path()), 0
+
+    async def ask_clocks() -> None:
+        nonlocal asked
+        asked += 1
+        daemon._on_packet("cl/v1/test/agent/002/clock", b"", time.monotonic(), 0)
+
+    daemon.radio.ask_clocks = ask_clocks  # type: ignore[method-assign]
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: daemon.core.counters["ticks"] > 2, "a tick")
+    # WHEN the core fails at whatever it is asked, and the system's clock steps every time
+    core = daemon.onboard
+
+    def fails(*_: Any, **__: Any) -> Any:
+        raise RuntimeError("a bug in the core")
+
+    with monkeypatch.context() as broken:
+        for name in ("advance", "on_packet", "on_gone", "on_uwb", "on_mavlink", "serve_autopilot"):
+            broken.setattr(core, name, fails)
+        broken.setattr(core, "keep_house", lambda **_: True)
+        asked = 0
+        daemon._on_packet("cl/v1/test/agent/002/meas", b"", 0.0, 0)
+        daemon._on_gone(2)
+        daemon._on_uwb(b"", 0.0)
+        assert not daemon._on_mavlink(b"")
+        await until(lambda: asked > 3, "housekeeping that goes on")
+        assert not running.done()
+    # THEN all of it is counted, each kind said once, and the flight goes on as soon as the core does
+    ticks, faults = daemon.core.counters["ticks"], daemon.state().counters["program faults"]
+    assert faults > 10
+    assert len([record for record in caplog.records if record.exc_info]) == 1
+    await until(lambda: daemon.core.counters["ticks"] > ticks + 2, "further ticks")
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    assert daemon.state().counters["program faults"] == faults
+
+
+@pytest.mark.parametrize("broken", ["radio", "_link", "state"])
+async def test_the_record_gets_its_end_whatever_fails_before_it(
+    config_of: Any, tmp_path: Path, caplog: pytest.LogCaptureFixture, broken: str
+) -> None:
+    # GIVEN a daemon with a record
+    ending = Watching(False)
+    daemon = Daemon(config_of(1, "security.mode=unsigned"), 1, make_estimator, Path(), (ending,))
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: ending.estimates > 2, "estimates")
+
+    # WHEN a part of it fails to close (it is closed all the same, for the sake of this test)
+    def fails() -> Any:
+        raise TimeoutError(110, "Connection timed out")
+
+    if broken == "state":
+        daemon.state = fails  # type: ignore[method-assign]
+    else:
+        part = getattr(daemon, broken)
+        close = part.close
+
+        async def close_and_fail() -> None:
+            await close()
+            fails()
+
+        part.close = close_and_fail
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    # THEN that is said, and the observers and the record came to their end
+    assert ending.ended
+    assert "Connection timed out" in caplog.text
+    summary = json.loads((tmp_path / "rec" / "agent_001.json").read_text())
+    assert summary["counters"]["program faults"] >= 1
+    assert len(read_record(tmp_path / "rec" / "agent_001.estimates")[1]) > 2
+
+
 class Watching(Observer):
     """Counts what it is told; raises at every estimate if it is to."""
 

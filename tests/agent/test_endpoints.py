@@ -36,7 +36,10 @@ def test_both_spellings_are_understood(text: str, expected: Endpoint) -> None:
 
 @pytest.mark.parametrize(
     "text",
-    ["", "udp", "http://x:1", "udpin:x", "udpin:x:99999", "udpout::1", "serial:", "serial:/dev/x:fast"],
+    [
+        *("", "udp", "http://x:1", "udpin:x", "udpin:x:99999", "udpout::1", "serial:", "serial:/dev/x:fast"),
+        *("tcpout:..bad:5760", "udpin:256.0.0.1:1", "tcp:a b:1", "udpout:x..y:1", f"tcp:{'x' * 64}:1"),
+    ],
 )
 def test_what_is_no_address_is_refused_by_name(text: str) -> None:
     with pytest.raises(EndpointError) as caught:

@@ -47,6 +47,39 @@ async def test_a_socket_left_by_a_killed_daemon_is_taken_over(tmp_path: Path) ->
     await successor.close(state_of(State.OK))
 
 
+async def test_a_socket_that_another_daemon_serves_is_left_to_it(tmp_path: Path) -> None:
+    # GIVEN a daemon's socket
+    path = tmp_path / "health.sock"
+    first, second = HealthSocket(path), HealthSocket(path)
+    await first.open()
+    # WHEN another daemon is configured to the same THEN it says so, and its end does not touch the first's
+    with pytest.raises(LinkError, match=rf"health socket {path}: another daemon listens there"):
+        await second.open()
+    await second.close(state_of(State.INIT))
+    assert (await answer_of(first, path))["state"] == "init"
+    await first.close(state_of(State.OK))
+    assert not path.exists()
+
+
+async def test_only_ones_own_socket_is_removed(tmp_path: Path) -> None:
+    # GIVEN a socket that was removed under its daemon, and one that another daemon made in its place
+    path = tmp_path / "health.sock"
+    first, second = HealthSocket(path), HealthSocket(path)
+    await first.open()
+    path.unlink()
+    await second.open()
+    # WHEN the first ends THEN the second goes on
+    await first.close(state_of(State.OK))
+    assert (await answer_of(second, path))["state"] == "init"
+    path.unlink()
+    await second.close(state_of(State.OK))  # nothing left to remove
+
+
+async def test_a_path_that_is_too_long_for_a_socket_is_named(tmp_path: Path) -> None:
+    with pytest.raises(LinkError, match=r"health socket .*: cannot be opened: .*too long"):
+        await HealthSocket(tmp_path / ("x" * 120)).open()
+
+
 async def test_a_folder_that_is_not_there_is_named(tmp_path: Path) -> None:
     path = tmp_path / "nowhere" / "health.sock"
     with pytest.raises(LinkError, match=r"health socket .*nowhere.*: cannot be opened"):

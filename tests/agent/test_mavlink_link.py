@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import errno
 import os
 import pty
 import socket
@@ -121,6 +122,71 @@ async def test_tcp_links_talk_and_the_dialling_one_comes_back(quick_reopen: None
     await until(lambda: b"M again" in b"".join(inbox.data))
     await client.close()
     await again.close()
+
+
+@pytest.mark.parametrize("number", [errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ECONNRESET])
+async def test_a_connection_that_the_network_ends_is_dialled_again(quick_reopen: None, number: int) -> None:
+    # GIVEN a link to a server
+    server = TcpLink(Endpoint(LinkKind.TCP_IN, HOST, 0), Inbox())
+    await server.open()
+    client = TcpLink(Endpoint(LinkKind.TCP_OUT, HOST, server.port), Inbox())
+    await client.open()
+    await until(lambda: bool(client.peer))
+    # WHEN the system gives the connection up, as it does for an end that no longer acknowledges
+    assert client._writer is not None
+    client._writer.transport.get_protocol().connection_lost(OSError(number, os.strerror(number)))
+    # THEN that is counted and it is dialled again, and the end of the link is an orderly one
+    await until(lambda: client.opened == 2)
+    assert client.dropped >= 1
+    await client.close()
+    await server.close()
+
+
+async def test_a_connection_is_watched_by_the_system() -> None:
+    server = TcpLink(Endpoint(LinkKind.TCP_IN, HOST, 0), Inbox())
+    await server.open()
+    client = TcpLink(Endpoint(LinkKind.TCP_OUT, HOST, server.port), Inbox())
+    await client.open()
+    await until(lambda: bool(client.peer and server.peer))
+    for link in (client, server):
+        assert link._writer is not None
+        connection = link._writer.get_extra_info("socket")
+        await until(lambda c=connection: bool(c.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)))  # type: ignore[misc]
+        await link.close()
+
+
+async def test_an_end_that_takes_nothing_any_more_is_let_go_without_waiting_for_it() -> None:
+    # GIVEN a client that reads nothing, and more sent to it than the system buffers
+    server = TcpLink(Endpoint(LinkKind.TCP_IN, HOST, 0), Inbox())
+    await server.open()
+    stuck = [socket.create_connection((HOST, server.port)) for _ in range(1)]
+    await until(lambda: bool(server.peer))
+
+    def fill() -> bool:
+        server.send(bytes(60_000))
+        return bool(server.dropped)
+
+    await until(fill)
+    # WHEN it is renewed THEN the connection is gone, and a new one serves
+    server.renew()
+    await until(lambda: not server.peer)
+    stuck.append(socket.create_connection((HOST, server.port)))
+    await until(lambda: server.opened == 2)
+    server.dropped = 0
+    await until(fill)
+    # and closing does not wait either
+    await asyncio.wait_for(server.close(), PATIENCE_S)
+    for connection in stuck:
+        connection.close()
+
+
+@pytest.mark.parametrize("kind", [LinkKind.UDP_IN, LinkKind.UDP_OUT, LinkKind.TCP_IN, LinkKind.TCP_OUT])
+@pytest.mark.parametrize("host", ["..bad", "x" * 64 + ".example", "nul\0"])
+async def test_what_is_neither_name_nor_address_is_one_clear_line(kind: LinkKind, host: str) -> None:
+    link = create_link(Endpoint(kind, host, 5760), Inbox())
+    with pytest.raises(LinkError, match=f"mavlink {kind}:.*:5760: cannot be opened: "):
+        await link.open()
+    await link.close()
 
 
 async def test_a_serial_link_reads_writes_and_survives_unplugging(quick_reopen: None) -> None:

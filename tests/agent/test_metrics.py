@@ -7,11 +7,13 @@ import socket
 import urllib.error
 import urllib.request
 
+import msgspec
 import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
 from agent.config import config_from
+from agent.config_monitor import MetricsTable
 from agent.config_tables import FleetConfig
 from agent.errors import LinkError
 from agent.health import Health, State
@@ -131,6 +133,14 @@ async def test_a_port_that_is_taken_keeps_the_daemon_from_starting() -> None:
         with pytest.raises(LinkError, match=rf"metrics 127\.0\.0\.1:{taken}: cannot be listened on"):
             await metrics.open()
         await metrics.close(state())
+
+
+async def test_a_port_beyond_the_last_keeps_the_daemon_from_starting() -> None:
+    config = msgspec.structs.replace(fleet(24_000), metrics=MetricsTable(base_port=65_535))
+    metrics = Metrics(config, 2)
+    with pytest.raises(LinkError, match=r"metrics 127\.0\.0\.1:65536: cannot be listened on: .*0-65535"):
+        await metrics.open()
+    await metrics.close(state())
 
 
 def test_every_state_of_the_daemon_is_a_family_of_its_own_name() -> None:

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.clock import FleetClock
+from agent.clock import FleetClock, require_epoch
 from agent.config_tables import FleetConfig
-from agent.errors import RecordError
+from agent.errors import ConfigError, RecordError
 from agent.health import Facts, Health, HealthMonitor, State, assess
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady, estimate_message
 from agent.recording import (
     EstimateRecorder,
@@ -27,6 +28,7 @@ from agent.recording import (
 from agent.warmup import warm_up
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
+from transport.auth import UNSIGNED
 
 MakeConfig = Callable[..., FleetConfig]
 
@@ -55,6 +57,40 @@ def test_a_step_of_utc_is_followed_at_once_and_said(size_s: float, forward: bool
     assert clock.steps == 1
 
 
+def test_an_epoch_that_leaves_now_without_a_tick_is_refused(make_config: MakeConfig) -> None:
+    now_s = 1_790_000_000.0
+    assert require_epoch(make_config().fleet, "fleet.toml", unix_s=now_s) is None
+    for epoch_s in (0.0, 4_000_000_000.0):
+        fleet = make_config(3, f"fleet.epoch_unix_s={epoch_s}").fleet
+        expected = r"fleet.toml: fleet.epoch_unix_s: expected 1360503270..1790000000, .* found "
+        with pytest.raises(ConfigError, match=f"{expected}{epoch_s:.0f}$"):
+            require_epoch(fleet, "fleet.toml", unix_s=now_s)
+
+
+def test_a_host_that_was_never_told_the_time_is_no_fault_of_the_epoch(make_config: MakeConfig) -> None:
+    fleet = make_config().fleet
+    assert require_epoch(fleet, "fleet.toml", unix_s=1e9) == "clock at 2001-09-09, outside the fleet's time"
+    # nor where it went on from its last shutdown, a month before the fleet's epoch
+    fleet = make_config(3, "fleet.epoch_unix_s=1790000000").fleet
+    assert require_epoch(fleet, "fleet.toml", unix_s=1_790_000_000.0 - 30 * 86_400.0) is not None
+
+
+def test_the_health_says_while_ticks_fit_no_packet(make_config: MakeConfig) -> None:
+    # GIVEN a companion computer that starts before its clock is set
+    config = make_config()
+    onboard = OnboardAgent(config, 1, make_estimator, UNSIGNED, unix_s=1e9, host_s=0.0)
+    for step in range(20):
+        onboard.advance(0.05 * step)
+    health = onboard.core.health.health
+    assert health.state is State.INIT
+    assert health.reasons[0] == "clock at 2001-09-09, outside the fleet's time"
+    # WHEN it is set THEN that is over
+    assert onboard.keep_house(unix_s=1_790_000_000.0, host_s=1.0)
+    for step in range(20):
+        onboard.advance(1.0 + 0.05 * step)
+    assert not [reason for reason in onboard.core.health.health.reasons if reason.startswith("clock")]
+
+
 # --- health ------------------------------------------------------------------------------------------------
 
 
@@ -79,6 +115,11 @@ def facts(**changed: Any) -> Facts:
         ({"gps_age_s": None}, State.OK, Health(State.DEGRADED, ("no GPS",))),
         ({"imu_coverage": 0.5}, State.OK, Health(State.DEGRADED, ("IMU incomplete",))),
         ({"silent_neighbours": (2, 5)}, State.OK, Health(State.DEGRADED, ("not heard: 2, 5",))),
+        (
+            {"silent_neighbours": tuple(range(901, 943))},
+            State.OK,
+            Health(State.DEGRADED, ("not heard: 901, 902, 903, 904, 905, 906, 907, 908, ... and 34 more",)),
+        ),
         ({"autopilot": "lost"}, State.OK, Health(State.DEGRADED, ("autopilot lost",))),
         ({"status": Status.FELL_BACK}, State.OK, Health(State.DEGRADED, ("estimate fell back",))),
         ({"status": Status.NOT_CONVERGED}, State.OK, Health(State.OK, ())),

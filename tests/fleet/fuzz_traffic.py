@@ -25,7 +25,7 @@ from transport.uwb_body import UwbFrame, UwbRange, encode_uwb_binary, encode_uwb
 
 TARGET, NEIGHBOURS = 2, (1, 3)
 HEARD = (Stream.MEAS, Stream.INFO)
-UNHEARD = (Stream.EST, Stream.CLOCK, Stream.CARD, Stream.DIAG)
+UNHEARD = (Stream.EST, Stream.CLOCK, Stream.DIAG)
 CAPTURED_FOR_S = 3.0
 """A captured packet has reached the daemon long before it is sent again."""
 LONG_AGO_S = 1_234_567.0

@@ -2,9 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
-from fleetloc.run_files import clear, keep_earlier_record, record_path, records
+import pytest
+
+from agent.config import load_config
+from fleetloc import cli
+from fleetloc.errors import InputError
+from fleetloc.run_files import clear, in_folder, keep_earlier_record, record_path, records, refuse_inputs
+
+LINE3 = Path(__file__).parents[2] / "configs" / "line3.toml"
 
 
 def names(paths: list[Path]) -> list[str]:
@@ -41,3 +49,50 @@ def test_clearing_removes_what_a_run_wrote_and_nothing_else(tmp_path: Path) -> N
         (folder / name).write_text("")
     clear(folder)
     assert sorted(path.name for path in folder.iterdir()) == sorted(kept)
+
+
+@pytest.mark.parametrize("name", ["fleet.toml", "agent_001.tlog", "agent_002.1.mcap", "truth.npz", "agent_001.csv"])
+def test_a_folder_in_which_a_run_would_lose_its_input_is_refused(tmp_path: Path, name: str) -> None:
+    kept, linked = tmp_path / name, tmp_path / "elsewhere" / "another name"
+    kept.write_text("precious")
+    linked.parent.mkdir()
+    linked.symlink_to(kept)
+    also = re.compile(r"agent_[0-9]{3}\.csv")
+    for path in (kept, linked):
+        with pytest.raises(InputError, match=f"--out: {tmp_path}: expected another folder.* an input .*{name}"):
+            refuse_inputs(tmp_path, ("recorded", path), also)
+    # what is of another name, or in another folder, is in no danger
+    refuse_inputs(tmp_path, (tmp_path / "no such file", LINE3), also)
+    refuse_inputs(tmp_path / "new", (kept,), also)
+
+
+@pytest.mark.parametrize("command", [("fleet", "--lockstep"), ("fleet",), ("sitl",)])
+def test_a_run_does_not_overwrite_the_configuration_it_is_given(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], command: tuple[str, ...]
+) -> None:
+    mine = tmp_path / "fleet.toml"
+    text = LINE3.with_stem("sitl3" if command[0] == "sitl" else "line3").read_text()
+    mine.write_text(text)
+    assert cli.main([command[0], str(mine), "--out", str(tmp_path), *command[1:]]) == 2
+    stderr = capsys.readouterr().err
+    assert f"--out: {tmp_path}: expected another folder" in stderr
+    assert stderr.count("\n") == 1
+    assert mine.read_text() == text
+
+
+def test_a_run_does_not_overwrite_what_is_laid_over_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    profile = tmp_path / "fleet.toml"
+    profile.write_text("[transport]\nloss = 0.1\n")
+    arguments = ["fleet", str(LINE3), "--with", str(profile), "--out", str(tmp_path), "--lockstep"]
+    assert cli.main(arguments) == 2
+    assert "an input of this run, fleet.toml" in capsys.readouterr().err
+    assert profile.exists()
+
+
+def test_the_folders_of_keys_and_state_are_found_from_anywhere(tmp_path: Path) -> None:
+    config = load_config(LINE3, ["security.keys=mine", "security.state=run/state"])
+    written = in_folder(config, tmp_path, tmp_path / "out")
+    assert written.security.keys == str(tmp_path / "mine")
+    assert written.security.state == str(tmp_path / "run" / "state")
+    assert written.record.directory == str(tmp_path / "out")
+    assert in_folder(load_config(LINE3), tmp_path, tmp_path).security.state is None

@@ -27,6 +27,16 @@ def test_check_prints_what_is_in_effect(tmp_path: Path, capsys: pytest.CaptureFi
     assert load_config(printed) == load_config(LINE3, ["estimator.window=3"])
 
 
+@pytest.mark.parametrize("epoch_s", [0, 4_000_000_000])
+def test_an_epoch_whose_ticks_fit_no_packet_is_refused(capsys: pytest.CaptureFixture[str], epoch_s: int) -> None:
+    for command in (["check", str(LINE3)], ["agent", str(LINE3), "--id", "1"]):
+        assert cli.main([*command, "--set", f"fleet.epoch_unix_s={epoch_s}"]) in (2, 3)
+        stderr = capsys.readouterr().err
+        assert "line3.toml: fleet.epoch_unix_s: expected " in stderr
+        assert f"found {epoch_s}" in stderr
+        assert stderr.count("\n") == 1
+
+
 def test_check_looks_at_the_scenario_too(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["check", str(LINE3), "--set", "sim.paths.1.lap_s=2"]) == 2
     assert "path: expected one that needs at most 2.0 m/s2" in capsys.readouterr().err

@@ -37,6 +37,11 @@ class Sender:
             self.signing.unix_s = unix_s
         return self._encoder.encode(heartbeat() if boot_ms == 5 else mavlink.MAVLink_system_time_message(0, boot_ms))
 
+    def time_question(self, unix_s: float) -> bytes:
+        if self.signing is not None:
+            self.signing.unix_s = unix_s
+        return self._encoder.encode(mavlink.MAVLink_timesync_message(0, 12345))
+
 
 def heartbeat() -> Message:
     return mavlink.MAVLink_heartbeat_message(mavlink.MAV_TYPE_QUADROTOR, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
@@ -185,6 +190,30 @@ class Notes:
 
     def note_sent(self, frames: list[bytes], unix_s: float) -> None:
         """Not of interest."""
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_our_own_frames_sent_back_to_us_are_nobodys_word(signed: bool) -> None:
+    """They bear our own good signature, and no stamp of ours is kept among those that came in."""
+    # GIVEN an agent whose autopilot asks for the time
+    config = load_config(PROFILES / "field.toml")
+    signing = LinkSigning(KEY, unix_s=NOW_S) if signed else None
+    onboard = OnboardAgent(config, 1, make_estimator, UNSIGNED, unix_s=NOW_S, host_s=50.0, signing=signing)
+    autopilot = Sender(KEY if signed else None)
+    assert onboard.on_mavlink(autopilot.frame(), 50.0)
+    assert onboard.on_mavlink(autopilot.time_question(NOW_S + 0.1), 50.1)
+    # WHEN somebody sends back what the agent sends: heartbeat, answer, questions
+    sent = onboard.serve_autopilot(50.2)
+    assert len(sent) == 4
+    heard = onboard.autopilot.heard
+    drew_answers = [onboard.on_mavlink(frame, 50.3) for frame in sent]
+    # THEN each is refused and counted, none draws our frames to the sender, and the autopilot is still answered
+    assert drew_answers == [False] * 4
+    assert onboard.autopilot.heard == heard
+    assert onboard.autopilot.ignored == {"own frame": 4}
+    onboard.on_mavlink(autopilot.time_question(NOW_S + 0.4), 50.4)
+    (answer,) = Decoder(datagrams=True).feed(onboard.serve_autopilot(50.5)[0])
+    assert (answer.get_type(), answer.ts1) == ("TIMESYNC", 12345)
 
 
 def test_an_agent_connects_to_its_signing_autopilot_only_and_notes_nothing_forged() -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import os
 import stat
 import time
 from collections.abc import Callable
@@ -25,11 +27,13 @@ from agent.security import (
     security_faults,
     signs_mavlink,
     stamp_file,
+    state_warnings,
 )
 from estimators.factory import make_estimator
 from fleetloc import cli
 from tests.security.conftest import PROFILES, MakeFleet
 from transport.auth import UNSIGNED
+from transport.errors import KeyFileError
 from transport.shared_keys import load_mavlink_key
 
 DAY_S = 86_400.0
@@ -162,6 +166,20 @@ def test_the_daemon_refuses_to_start(make_fleet: MakeFleet, caplog: pytest.LogCa
     assert "agent_001.pem: no such certificate" in caplog.records[-1].getMessage()
 
 
+def test_a_start_number_that_cannot_be_written_is_no_fault_of_the_keys(
+    make_fleet: MakeFleet, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A service manager tries again: the disk may have room then."""
+    config, base = make_fleet("lossy_field", "mavlink.appear_timeout_s=0.1")
+
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    assert run(config, 1, make_estimator, base=base) is ExitCode.STATE
+    assert "agent_001.boot: cannot be written: No space left on device" in caplog.records[-1].getMessage()
+
+
 def test_what_outlives_a_restart_can_be_kept_outside_a_folder_of_keys_that_is_read_only(
     make_fleet: MakeFleet, tmp_path: Path
 ) -> None:
@@ -281,3 +299,19 @@ def test_the_passphrase_is_what_the_key_is_made_of(
     assert cli.main(["keys", "passphrase", str(base / "fleet.toml"), "--id", "3"]) == 0
     text = capsys.readouterr().out.strip()
     assert hashlib.sha256(text.encode()).digest() == load_mavlink_key(folder_of(base, "field"), 3)
+
+
+def test_the_state_folder_is_made_where_only_itself_is_missing(make_fleet: MakeFleet) -> None:
+    config, base = make_fleet("lab", "security.state=state")
+    assert state_warnings(config, base) == []
+    own = credentials(config, 1, base, unix_s=time.time(), salt=new_salt())
+    assert stat.S_IMODE((base / "state").stat().st_mode) == 0o700
+    assert (base / "state" / "agent_001.boot").read_text() == f"{own.boot}\n"
+
+
+def test_a_state_folder_without_a_place_is_named(make_fleet: MakeFleet, capsys: pytest.CaptureFixture[str]) -> None:
+    config, base = make_fleet("lab", "security.state=run/state")
+    with pytest.raises(KeyFileError, match=f"security.state: {base}/run, in which it would be made, is not there"):
+        credentials(config, 1, base, unix_s=time.time(), salt=new_salt())
+    assert cli.main(["check", str(base / "fleet.toml"), "--set", "security.state=run/state"]) == 0
+    assert f"warning: security.state: neither {base}/run/state nor the folder" in capsys.readouterr().err

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
@@ -16,19 +17,23 @@ from nacl.signing import SigningKey
 
 from agent.config_tables import FleetConfig
 from agent.radio import Radio
-from agent.security import agent_session, observer_session
+from agent.security import agent_session, driver_session, observer_session
 from tests.security.conftest import MakeFleet
+from tests.support.fleet_process import bound
 from transport.certificate_files import Member, authority_path
 from transport.certificates import issue, make_authority
+from transport.clock_body import ClockAnswer, decode_clock_question
 from transport.envelope import Envelopes
 from transport.keys import load_secret
 from transport.measurement_body import Measurements, SpeedRecord
 from transport.opening import Opener
 from transport.sealing import Sealer
-from transport.session import Handlers, Session
+from transport.session import Handlers, Session, open_session
 from transport.session_settings import SessionSettings, TlsSettings, zenoh_config
 from transport.shared_keys import load_group_keys
 from transport.streams import Stream, key_expression
+from transport.uwb_body import UwbFrame, UwbRange, encode_uwb_json
+from transport.uwb_seal import UwbSeal
 
 BOUND_S = 30.0
 BOOT = 2_000_000_000
@@ -39,17 +44,24 @@ class Target:
     """Agent 1 of a fleet as its daemon holds it: the radio, and the opener behind it."""
 
     def __init__(self, config: FleetConfig, base: Path) -> None:
-        self.radio = Radio(config, 1, base, self._on_packet, lambda *_: None, lambda _: None)
+        self.radio = Radio(config, 1, base, self._on_packet, self._on_uwb, lambda _: None)
+        self.ranged: asyncio.Queue[bytes] = asyncio.Queue()
         fleet, freshness_s = config.fleet.name, config.security.freshness_s
         self.opener = Opener(fleet, config.ids, self.radio.trust, own_id=1, freshness_s=freshness_s)
         self.heard: asyncio.Queue[int] = asyncio.Queue()
+        self.clock_answers: list[ClockAnswer] = []
         self.ticks: list[int] = []
 
     def _on_packet(self, key: str, data: bytes, arrived_s: float, unix_ns: int) -> None:
         received = self.opener.open(key, data, now=arrived_s, unix_ns=unix_ns)
+        if received is not None and isinstance(received.message, ClockAnswer):
+            self.clock_answers.append(received.message)
         if received is not None and isinstance(received.message, Measurements):
             self.heard.put_nowait(received.message.tick)
             self.ticks.append(received.message.tick)
+
+    def _on_uwb(self, payload: bytes, _arrived_s: float) -> None:
+        self.ranged.put_nowait(payload)
 
     def rejected(self) -> dict[str, int]:
         """Packets refused, by reason, as the daemon reports them."""
@@ -112,12 +124,18 @@ class Voice:
         self._sealer = Sealer(fleet or config.fleet.name, agent_id, boot=boot, signing=signing)
         keys = group_keys or load_group_keys(folder)
         self._envelopes = Envelopes(keys, agent_id, boot=boot, salt=SALT) if config.security.encrypt else None
+        self._fleet, self._agent_id = config.fleet.name, agent_id
         self._key = key_expression(config.fleet.name, agent_id, Stream.MEAS)
         self._t_off_s = t_off_s
 
     def packet(self, tick: int) -> bytes:
         (packet,) = self._sealer.seal(measurements(tick), t_ns=time.time_ns() + round(self._t_off_s * 1e9))
         return packet.data
+
+    def clock_answer(self, answer: ClockAnswer) -> bytes:
+        (packet,) = self._sealer.seal(answer, t_ns=time.time_ns())
+        key = key_expression(self._fleet, self._agent_id, Stream.CLOCK)
+        return packet.data if self._envelopes is None else self._envelopes.close(key, packet.data)
 
     def __call__(self, tick: int) -> bytes:
         data = self.packet(tick)
@@ -297,6 +315,31 @@ async def test_a_hostile_member_without_tls_is_refused_and_counted(make_fleet: M
         assert one.opener.peers[3].received == 0
 
 
+async def test_a_clocks_answer_to_somebody_elses_question_is_refused_and_counted(make_fleet: MakeFleet) -> None:
+    # GIVEN agent 1, and who answers it with what agent 2 said a second ago to another question: signed all the same
+    config, base = make_fleet("lossy_field", "transport.link=tcp", "fleet.edges=[[1,2]]")
+    two, off_ns = Voice(config, base), [1_000_000_000]
+
+    def answer(question: bytes, arrived_ns: int) -> bytes:
+        return two.clock_answer(ClockAnswer(decode_clock_question(question) - off_ns[0], arrived_ns, arrived_ns))
+
+    handlers = Handlers(lambda *_: None, on_clock_question=answer)
+    async with target(config, base) as one, lawless(dialling(config, base, 2), config, 2, handlers) as asked:
+        asked.announce()
+        end_s = time.monotonic() + BOUND_S
+        # WHEN agent 1 asks THEN it is refused
+        while not one.rejected():
+            assert time.monotonic() < end_s, "no answer came"
+            await one.radio.ask_clocks()
+        assert set(one.rejected()) == {"wrong_answer"}
+        assert one.clock_answers == []
+        # and an answer to its own question is taken
+        off_ns[0] = 0
+        while not one.clock_answers:
+            assert time.monotonic() < end_s, "no answer is taken"
+            await one.radio.ask_clocks()
+
+
 async def test_what_goes_over_the_air_is_encrypted(make_fleet: MakeFleet) -> None:
     config, base = make_fleet("lossy_field", "transport.link=tcp", "fleet.edges=[[1,2]]")
     heard: asyncio.Queue[bytes] = asyncio.Queue()
@@ -310,3 +353,48 @@ async def test_what_goes_over_the_air_is_encrypted(make_fleet: MakeFleet) -> Non
             key_expression(config.fleet.name, 1, Stream.MEAS), air
         )
         assert opened[:2] == b"CL"
+
+
+def range_frame(seq: int, range_m: float) -> bytes:
+    """What a driver of agent 1 publishes."""
+    return encode_uwb_json(UwbFrame(seq, "unix", time.time_ns(), (UwbRange(2, range_m, 0.05),), 1))
+
+
+async def put_ranges_until(session: Session, frame: bytes, happened: Callable[[], bool]) -> None:
+    """Put a frame on agent 1's UWB key until something comes of it."""
+    end_s = time.monotonic() + BOUND_S
+    while not happened():
+        assert time.monotonic() < end_s, "nothing comes of the frames"
+        session.publish(Stream.UWB, frame, agent_id=1)
+        await asyncio.sleep(0.05)
+
+
+@pytest.mark.parametrize("link", ["tcp", "udp", "multilink"])
+async def test_ranges_that_do_not_come_from_the_drones_own_driver_are_refused_and_counted(
+    make_fleet: MakeFleet, link: str
+) -> None:
+    # GIVEN agent 1 of a lossy_field fleet, its devices on one port and its radio on another
+    with bound(socket.SOCK_STREAM) as devices, bound(socket.SOCK_STREAM) as on_radio:
+        places = [f'agents.1.listen=["tcp/127.0.0.1:{devices}"]', "agents.1.radio=127.0.0.1"]
+    places += [f"transport.radio_port={on_radio}", f"transport.link={link}", "fleet.edges=[[1,2]]"]
+    config, base = make_fleet("lossy_field", *places)
+    radio = config.listen(1)[-1:]  # datagrams, where there are any
+    async with target(config, base) as one, contextlib.AsyncExitStack() as stack:
+        counted = one.radio.counters
+        # WHEN a stranger without any key puts ranges on its key over the radio, and a member seals its own likewise
+        stranger = await stack.enter_async_context(lawless(SessionSettings(connect=radio), config, None))
+        await put_ranges_until(
+            stranger, range_frame(1, 777.0), lambda: counted().get("rejected uwb unsigned", 0) > 0
+        )
+        foreign = UwbSeal(load_secret(base / config.security.keys, 2))
+        sealed = foreign.close(key_expression(config.fleet.name, 1, Stream.UWB), range_frame(2, 888.0))
+        await put_ranges_until(stranger, sealed, lambda: counted().get("rejected uwb bad_signature", 0) > 0)
+        # THEN nothing of it is measured, while the drone's own driver is heard
+        assert one.ranged.empty()
+        driver = await open_session(
+            driver_session(config, 1, base), config.fleet.name, 1, config.ids, Handlers(lambda *_: None)
+        )
+        stack.push_async_callback(driver.close)
+        own = range_frame(3, 9.0)
+        await put_ranges_until(driver, own, lambda: not one.ranged.empty())
+        assert one.ranged.get_nowait() == own

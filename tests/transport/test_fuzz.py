@@ -25,7 +25,7 @@ from transport.measurement_body import (
     VelocityRecord,
 )
 from transport.opening import Opener
-from transport.report_body import Card, Diagnostics
+from transport.report_body import Diagnostics
 from transport.sealing import Message, Sealer
 from transport.streams import key_expression
 from transport.uwb_body import UwbFrame, UwbRange, decode_uwb, encode_uwb_binary, encode_uwb_json
@@ -50,7 +50,6 @@ MESSAGES: list[Message] = [
     Information(9, 1, 8, 6, (1, 2), np.eye(12) + 0.5, np.ones(12)),
     Information(9, 0, 8, 6, (1, 2, 3, 4), np.eye(24) + 0.5, np.ones(24)),
     FleetEstimate(9, 0, (2, 3), np.arange(12.0), np.ones(12), (0, 1), np.eye(6)),
-    Card(2, "two", endpoints=("tcp/127.0.0.1:1",)),
     Diagnostics(2, "NOMINAL", ("why",), {"received": 3}, {"age_s": 0.5}),
     ClockAnswer(1, 2, 3),
 ]
@@ -103,7 +102,7 @@ def assert_sound(message: Message | None) -> None:
             assert set(message.agents) <= set(ROSTER)
             assert np.isfinite(message.mean).all()
             assert (message.variance >= 0).all()
-        case Card() | Diagnostics():
+        case Diagnostics():
             assert message.agent_id == SENDER
         case _:
             assert message is None or isinstance(message, ClockAnswer)
@@ -133,9 +132,10 @@ def test_no_mutation_of_a_signed_packet_is_accepted() -> None:
 def test_what_an_unsigned_fleet_accepts_is_at_least_sound() -> None:
     # GIVEN 60 000 mutated packets where nothing but the checks of header and body protects us
     rng, fed, accepted = np.random.default_rng(2), 0, 0
-    for key, packet in samples(UNSIGNED):
+    originals = samples(UNSIGNED)
+    for key, packet in originals:
         o = opener(UNSIGNED)
-        for number, changed in enumerate(mutations(packet, rng, 60_000 // 8, first_byte=HEADER_BYTES)):
+        for number, changed in enumerate(mutations(packet, rng, 60_000 // len(originals), first_byte=HEADER_BYTES)):
             # as an attacker would: a fresh number and a matching length
             fields_ = list(HEADER.unpack_from(changed)) if len(changed) >= HEADER_BYTES else None
             if fields_ is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from pathlib import Path
@@ -10,7 +11,7 @@ import pytest
 from nacl.signing import SigningKey
 
 from transport.auth import fingerprint, sign, verify
-from transport.errors import KeyFileError, Rejected, SettingsError
+from transport.errors import KeyFileError, Rejected, SettingsError, UnwritableError
 from transport.keys import (
     add_key,
     init_keys,
@@ -164,6 +165,25 @@ def test_starts_are_numbered_upwards_whatever_the_clock_does(tmp_path: Path) -> 
     assert next_boot(path, 2000.0) == 2000
     path.unlink()
     assert next_boot(path, 2001.0) == 2001
+
+
+def test_a_full_disk_leaves_the_last_start_number_and_nothing_else(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # GIVEN the number of a start, and a disk that has filled up since
+    path = tmp_path / "boot"
+    next_boot(path, 1000.0)
+
+    def full(_descriptor: int) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    with monkeypatch.context() as disk:
+        disk.setattr(os, "fsync", full)
+        with pytest.raises(UnwritableError, match=r"boot: cannot be written: No space left on device"):
+            next_boot(path, 1000.0)
+    # THEN the number is as it was, no file was left behind, and the start after the next tidying up counts on
+    assert [file.name for file in tmp_path.iterdir()] == ["boot"]
+    assert next_boot(path, 1000.0) == 1001
 
 
 def test_a_spoilt_start_number_is_named(tmp_path: Path) -> None:

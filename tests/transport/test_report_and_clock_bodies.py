@@ -1,10 +1,9 @@
-"""Cards, diagnostics and clock answers."""
+"""Diagnostics and clock answers."""
 
 from __future__ import annotations
 
 import json
 
-import msgspec
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -18,28 +17,13 @@ from transport.clock_body import (
 )
 from transport.errors import EncodeError, Reason, Rejected
 from transport.report_body import (
-    Card,
     Diagnostics,
-    decode_card,
     decode_diagnostics,
-    encode_card,
     encode_diagnostics,
 )
 
 names = st.text(max_size=16)
 times = st.integers(0, 2**62)
-
-
-@settings(max_examples=50)
-@given(st.integers(1, 999), names, st.floats(0, 10), st.lists(names, max_size=8))
-def test_a_card_comes_back(agent_id: int, name: str, period_s: float, endpoints: list[str]) -> None:
-    card = Card(agent_id, name, period_s=period_s, endpoints=tuple(endpoints))
-    assert decode_card(encode_card(card)) == card
-
-
-def test_a_card_of_a_later_version_with_more_fields_is_read() -> None:
-    fields = [*msgspec.to_builtins(Card(5, "five")), "new", 7]
-    assert decode_card(msgspec.msgpack.encode(fields)) == Card(5, "five")
 
 
 @settings(max_examples=50)
@@ -64,33 +48,13 @@ def test_what_is_not_finite_is_not_reported(value: float) -> None:
         encode_diagnostics(Diagnostics(4, "NOMINAL", gauges={"age_s": value}))
     with pytest.raises(EncodeError, match="finite"):
         encode_diagnostics(Diagnostics(4, "NOMINAL", neighbours={"2": {"age_s": value}}))
-    with pytest.raises(EncodeError, match=r"Card: Expected `float`"):
-        encode_card(Card(4, period_s=value))
 
 
 def test_oversized_reports_are_not_sent() -> None:
-    with pytest.raises(EncodeError, match=r"Card: Expected `str` of length <= 64"):
-        encode_card(Card(4, "x" * 65))
+    with pytest.raises(EncodeError, match=r"Diagnostics: Expected `str` of length <= 64"):
+        encode_diagnostics(Diagnostics(4, "x" * 65))
     with pytest.raises(EncodeError, match="counters"):
         encode_diagnostics(Diagnostics(4, "NOMINAL", counters={str(i): i for i in range(257)}))
-
-
-@pytest.mark.parametrize(
-    "body",
-    [
-        b"",
-        b"\xdd\xff\xff\xff\xff",
-        b"\x91" * 100_000,
-        msgspec.msgpack.encode([1000]),
-        msgspec.msgpack.encode([1, "x" * 65]),
-        msgspec.msgpack.encode([1, "x", "x", 1, float("nan")]),
-        msgspec.msgpack.encode([1]) + b"\x00",
-    ],
-)
-def test_bad_cards_are_refused(body: bytes) -> None:
-    with pytest.raises(Rejected) as refused:
-        decode_card(body)
-    assert refused.value.reason is Reason.MALFORMED
 
 
 @pytest.mark.parametrize(

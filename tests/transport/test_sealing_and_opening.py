@@ -19,7 +19,7 @@ from transport.information_body import Information
 from transport.measurement_body import Measurements, PositionRecord, RangeRecord, SpeedRecord
 from transport.opening import Opener
 from transport.replay import ReplayGuard
-from transport.report_body import Card, Diagnostics
+from transport.report_body import Diagnostics
 from transport.sealing import Message, Packet, Sealer
 from transport.streams import Stream, key_expression
 
@@ -89,7 +89,6 @@ def resealed(packet: bytes, at: int, value: bytes) -> bytes:
 MESSAGES: list[tuple[Message, Stream]] = [
     (MEASUREMENTS, Stream.MEAS),
     (Measurements(0, ()), Stream.MEAS),
-    (Card(2, "two"), Stream.CARD),
     (Diagnostics(2, "NOMINAL", gauges={"age_s": 0.5}), Stream.DIAG),
     (ClockAnswer(1, 2, 3), Stream.CLOCK),
 ]
@@ -237,10 +236,10 @@ def test_strangers_our_own_id_and_other_fleets_are_refused() -> None:
 
 
 def test_a_packet_cannot_be_replayed_as_another_stream() -> None:
-    # GIVEN bytes that would be read as a card; THEN the signature binds them to the stream they were sent on
+    # GIVEN bytes that would be read as a clock's answer; THEN the signature binds them to the stream they came on
     receiver = Receiver()
-    card = sealed(Card(2))
-    assert receiver.open(header_with("kind", bytes([Kind.DIAG]))(card), stream=Stream.DIAG) is None
+    diagnostics = sealed(Diagnostics(2, "ok"))
+    assert receiver.open(header_with("kind", bytes([Kind.CLOCK]))(diagnostics), stream=Stream.CLOCK) is None
     assert receiver.refused == [Reason.BAD_SIGNATURE]
 
 
@@ -261,10 +260,10 @@ def test_duplicates_and_replays_are_refused_in_any_order() -> None:
 def test_packets_of_an_earlier_start_are_replays_on_every_stream() -> None:
     receiver = Receiver()
     old, new = sealer(boot=5), sealer(boot=6)
-    old_card = old.seal(Card(2), t_ns=T_NS)[0]
+    old_diagnostics = old.seal(Diagnostics(2, "ok"), t_ns=T_NS)[0]
     assert receiver.open(new.seal(MEASUREMENTS, t_ns=T_NS)[0]) is not None
     assert receiver.open(old.seal(MEASUREMENTS, t_ns=T_NS)[0]) is None
-    assert receiver.open(old_card) is None
+    assert receiver.open(old_diagnostics) is None
     assert receiver.refused == [Reason.REPLAY, Reason.REPLAY]
 
 
@@ -322,7 +321,7 @@ def test_a_properly_signed_bad_body_is_refused() -> None:
     # GIVEN a member that signs garbage: the signature is good, the numbers are not
     receiver, packet = Receiver(), sealed()
     assert receiver.open(resealed(packet, HEADER_BYTES, b"\xff")) is None
-    assert receiver.open(sealed(Card(3)), stream=Stream.CARD) is None
+    assert receiver.open(sealed(Diagnostics(3, "ok")), stream=Stream.DIAG) is None
     assert receiver.refused == [Reason.MALFORMED, Reason.OUT_OF_RANGE]
     assert receiver.opener.peers[2].received == 0
     assert receiver.opener.peers[2].age_s(9.0) is None

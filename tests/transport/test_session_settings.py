@@ -13,7 +13,6 @@ from transport.session_settings import (
     SessionSettings,
     TlsSettings,
     access_control,
-    loopback_settings,
     zenoh_config,
 )
 from transport.streams import Stream, key_expression, parse_key, presence_pattern
@@ -76,11 +75,22 @@ def test_an_observer_puts_nothing() -> None:
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["127.0.0.1:1", "tcp/127.0.0.1", "http/127.0.0.1:80", "", "tls/127.0.0.1:1"]
+    "endpoint",
+    [
+        *("127.0.0.1:1", "tcp/127.0.0.1", "http/127.0.0.1:80", "", "tls/127.0.0.1:1", "tcp/a b:1"),
+        *("tcp/127.0.0.1:99999", "tcp/127.0.0.1:abc", "tcp/127.0.0.1:", "tcp/:7447", "tcp/..bad:7447"),
+        *("tcp/::1:7447", "udp/1.2.3.256:7447"),
+    ],
 )
 def test_endpoints_that_cannot_be_used_are_named(endpoint: str) -> None:
     with pytest.raises(SettingsError, match=f"endpoint '{endpoint}'"):
         SessionSettings(listen=(endpoint,))
+
+
+def test_a_port_of_zero_is_for_those_who_listen() -> None:
+    SessionSettings(listen=("tcp/[::1]:0?rel=1", "udp/drone-1.local:7447#iface=wlan0"))
+    with pytest.raises(SettingsError, match=r"expected a port 1..65535"):
+        SessionSettings(connect=("tcp/127.0.0.1:0",))
 
 
 def test_no_plain_link_beside_tls() -> None:
@@ -99,14 +109,6 @@ def test_what_zenoh_refuses_is_an_error_of_the_settings() -> None:
 def test_bad_tables_are_refused(table: dict[str, object]) -> None:
     with pytest.raises(msgspec.ValidationError):
         msgspec.convert(table, SessionSettings)
-
-
-def test_on_one_machine_the_higher_id_dials() -> None:
-    settings = loopback_settings(2, [3, 1], 20_000)
-    assert settings.listen == ("tcp/127.0.0.1:20002",)
-    assert settings.connect == ("tcp/127.0.0.1:20001",)
-    with pytest.raises(SettingsError, match="agent 900 gets port 65900, over 65535"):
-        loopback_settings(900, [], 65_000)
 
 
 def test_keys() -> None:

@@ -120,7 +120,6 @@ function showLinks() {
     cell(row, `${link.sender} → ${link.receiver}`);
     cell(row, number(link.age_s, 1), link.level === "bad" ? "bad" : "");
     cell(row, known(link.loss) ? `${number(link.loss, 0, 100)} %` : "–", link.level === "warning" ? "warning" : "");
-    cell(row, link.late);
     cell(row, link.rejected, link.rejected ? "warning" : "");
     cell(row, number(link.round_trip_s, 1, 1000));
     cell(row, number(link.clock_offset_s, 1, 1000));

@@ -143,14 +143,14 @@ class Voice:
 
 
 async def put_until_heard(session: Session, one: Target, make: Callable[[int], bytes], tick: int) -> None:
-    """Put a member's good packets until one is heard: subscriptions take a moment to get around."""
+    """Put a member's good packets of a tick until one is heard: subscriptions take a moment to get around."""
     end_s = time.monotonic() + BOUND_S
-    while one.heard.empty():
+    heard = None
+    while heard != tick:  # those of an earlier tick may still have been under way
         assert time.monotonic() < end_s, "the member itself is not heard"
         session.publish(Stream.MEAS, make(tick))
         with contextlib.suppress(TimeoutError):
-            await asyncio.wait_for(one.heard.get(), 0.2)
-            return
+            heard = await asyncio.wait_for(one.heard.get(), 0.2)
 
 
 async def send_until_heard(one: Target, heard: asyncio.Queue[Any]) -> Any:

@@ -51,7 +51,7 @@ class _Good:
 class FleetTracker:
     """Runs one agent's estimator tick by tick; raises `ESTIMATOR_FAULTS` from `begin`, `mix` and `solve`.
 
-    ``counters`` is where it counts starts, joins, leaves and refused pairs.
+    ``counters`` is where it counts starts, joins, leaves, refused pairs, and moves of the estimate.
     """
 
     def __init__(
@@ -135,6 +135,7 @@ class FleetTracker:
         estimate = self._estimator.solve()
         if not _sound(estimate):
             raise ArithmeticError("the estimate is not finite or its covariance not positive")
+        self._counters["estimate moved"] += estimate.report.moves
         self._good = _Good(estimate, self.roll.members, self.roll.own_located)
         self.present = self.roll.members
         self.roll.note_estimate(estimate)

@@ -62,6 +62,9 @@ class SolverReport:
     cost: float = 0.0
     """Optimal value of (9), without the factor one half."""
     active_bounds: int = 0
+    moves: int = 0
+    """How often since the last tick the estimate was moved to where the data hold: its own state to another place, or
+    the whole fleet to its mirror image."""
 
 
 @dataclass(frozen=True, slots=True)

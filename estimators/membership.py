@@ -192,7 +192,8 @@ def _transplant_data(
     """What the data say of the kept agents stays; of a fresh one they say what its prior says."""
     at = states_of([new.layout.slot(agent) for agent in kept])
     slots = [old.layout.slot(agent) for agent in kept]
-    new.switches = old.switches
+    new.switches, new.reversals = old.switches, old.reversals
+    new._moved, new._mirror = old._moved, old._mirror
     new._data.information = information.copy()
     if kept:
         new._data.information[np.ix_(at, at)] = marginal_pair((old._data.information, old.prior_mean), slots)[0]

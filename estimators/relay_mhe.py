@@ -6,17 +6,20 @@ filtered, so that nothing is used twice; consensus on it only repairs what was l
 
 What an arrival cost holds is never linearised anew. So a range between places that are not known well enters it
 with what its linearisation misses (`estimators.second_order`), and a drone without fixes has a witness that keeps
-other places in mind (`estimators.witness`).
+other places in mind (`estimators.witness`), and so has the whole fleet (`estimators.fleet_mirror`).
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.data_information import DataInformation
 from estimators.estimator import Estimate, Payload, SolverReport, Status, symmetrised
+from estimators.fleet_mirror import FleetMirror, doubtful, mirror_offset, mirrored
 from estimators.inheritance import inherit, survey
 from estimators.layout import Layout, block
 from estimators.measurements import ROW, Matrix, Vector
@@ -52,6 +55,11 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
         self._witness = Witness(slot, self._own, period_s)
         self.switches = 0
         """How often the own state was moved to the only place that the data allow."""
+        self._mirror = FleetMirror()
+        self.reversals = 0
+        """How often the fleet turned out to be the mirror image of the estimate."""
+        self._moved = 0
+        """Both, at the last tick."""
 
     def _observability_rank(self) -> int:
         """Not used: consensus here has no weights."""
@@ -80,6 +88,21 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
             information = np.ascontiguousarray(problem.information)
             mean = np.asarray(np.linalg.solve(information, problem.vector), np.float64)
         self.prior_information, self.prior_mean = information, mean
+        self._look_at_mirror(problem, solution.path, full)
+
+    def _look_at_mirror(self, problem: WindowProblem, path: Matrix, full: bool) -> None:
+        """Weigh the oldest tick, whose rows are all there by now, as it leaves; become the image if that is it."""
+        if full:
+            self._mirror.weigh(problem.rows[: problem.start[1]], path[0], self.settings.norm_smoothing_m)
+        self._mirror.pass_by(self.prior_mean, self.prior_information)
+        if self._mirror.reversed:
+            self.reversals += 1
+            self._mirror = FleetMirror(-self._mirror.lead_nats)
+            _, self._covariance = mirrored(path[-1], self._covariance)
+            prior_covariance = symmetrised(np.linalg.inv(self.prior_information))
+            self.prior_mean, prior_covariance = mirrored(self.prior_mean, prior_covariance)
+            self.prior_information = symmetrised(np.linalg.inv(prior_covariance))
+            self._path = [state + mirror_offset(state) for state in self._path]
 
     def _filter(self, problem: WindowProblem, path: Matrix) -> tuple[Matrix, Vector]:
         """Information and mean one tick after the window's start; sets the covariance at its end.
@@ -111,9 +134,19 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
         return information, mean
 
     def _estimate(self, problem: WindowProblem, mean: Vector, status: Status, report: SolverReport) -> Estimate:
-        """The smoothed newest state with the covariance of the filter along the window."""
+        """The smoothed newest state, or its mirror image, with the covariance of the filter along the window."""
         if status is Status.OK and not len(problem.rows):
             status = Status.NO_DATA
+        mean = self._path[-1]
+        covariance, observable = self._doubted(problem, mean)
+        if not observable[self.slot] and status in (Status.OK, Status.NOT_CONVERGED):
+            status = Status.NOT_OBSERVABLE
+        moved, self._moved = self.switches + self.reversals - self._moved, self.switches + self.reversals
+        report = replace(report, moves=moved)
+        return Estimate(self.window.last, mean, covariance, status, self.window.ages(), report, observable)
+
+    def _doubted(self, problem: WindowProblem, mean: Vector) -> tuple[Matrix, NDArray[np.bool_]]:
+        """The covariance over all places that the fleet may be at, and whose place the data tell."""
         covariance, observable = self._covariance, self._observable
         opinion = self._second_opinion(problem, mean)
         if opinion is not None and opinion.ambiguous:
@@ -123,9 +156,13 @@ class RelayMovingHorizonEstimator(MovingHorizonEstimator):
             covariance = covering(covariance, opinion.second_moment, self.slot)
         if opinion is not None and opinion.elsewhere is not None:
             self._move(opinion.elsewhere, problem)
-        if not observable[self.slot] and status in (Status.OK, Status.NOT_CONVERGED):
-            status = Status.NOT_OBSERVABLE
-        return Estimate(self.window.last, mean, covariance, status, self.window.ages(), report, observable)
+        weighed = 1 if self.window.last - self.window.first == self.settings.window else 0
+        eps = self.settings.norm_smoothing_m
+        image = self._mirror.image(mean, problem.rows, problem.start[weighed:], self._path[weighed:], eps)
+        if image is not None:
+            observable = observable & ~doubtful(image, covariance)
+            covariance = image.covered(covariance)
+        return covariance, observable
 
     def _second_opinion(self, problem: WindowProblem, mean: Vector) -> Opinion | None:
         """Let the witness see the newest tick, and ask it about the estimate."""

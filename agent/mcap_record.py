@@ -26,8 +26,9 @@ from estimators.layout import STATES_PER_AGENT
 from transport.estimate_body import MAX_AGE_TICKS
 
 SUFFIX = ".mcap"
-CHUNK_BYTES = 16 * 1024
-"""What a killed process may lose of the file: less than a second of flight."""
+CHUNK_BYTES = 64 * 1024
+"""What a killed process may lose of the file: about a second of flight. Of every chunk the writer keeps 1 kB for its
+index until the file is closed."""
 ESTIMATE_SCHEMA, POSES_SCHEMA = "fleetloc.FleetEstimate", "foxglove.PosesInFrame"
 POSES_FRAME = "fleet_enu"
 AXES = ("north", "east", "down")

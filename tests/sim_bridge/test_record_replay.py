@@ -179,7 +179,7 @@ def test_the_rough_flight_was_rough(rough: OnboardFleet) -> None:
 def test_a_record_that_ended_at_its_size_repeats_the_flight_until_there(tmp_path: Path) -> None:
     limit = DiskLimit(tmp_path, 50_000, 0, lambda _: ROOM)
     fleet = OnboardFleet(load_config(LINE3), tmp_path, limit=limit)
-    fleet.fly(2.0)
+    fleet.fly(4.0)
     for agent in fleet.agents.values():
         written = agent.record.counters["record entries"]
         assert 0 < written < agent.record._inputs

@@ -39,6 +39,8 @@ from transport.uwb_seal import UwbSeal
 
 WARN_BEFORE_S = 14 * 86_400.0
 """Certificates that expire within this are warned of."""
+HOST_START = Path("/proc/sys/kernel/random/boot_id")
+"""Linux's name for the time since the computer was started."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -297,7 +299,7 @@ def credentials(config: FleetConfig, agent_id: int, base: Path, *, unix_s: float
     if config.security.encrypt:
         envelopes = Envelopes(load_group_keys(folder), agent_id, boot=boot, salt=salt)
     secret = load_secret(folder, agent_id)
-    seal = UwbSeal(secret) if seals_uwb(config) else None
+    seal = UwbSeal(secret, host_start()) if seals_uwb(config) else None
     return Credentials(secret, load_trust(folder, config.ids), boot, envelopes, seal)
 
 
@@ -348,11 +350,19 @@ def observer_session(config: FleetConfig, base: Path) -> SessionSettings:
     return SessionSettings(connect=tuple(dict.fromkeys(endpoints)), tls=tls_settings(config, None, base))
 
 
+def host_start() -> bytes:
+    """What tells this start of the computer from others, the same in all its containers; empty where nothing does."""
+    try:
+        return HOST_START.read_bytes().strip()
+    except OSError:
+        return b""
+
+
 def driver_session(config: FleetConfig, agent_id: int, base: Path) -> SessionSettings:
     """The session of a UWB driver beside an agent, under whose id it is to be opened: dials that agent.
 
     Raises `KeyFileError` where frames have to be sealed and the agent's signing key cannot be read.
     """
-    seal = UwbSeal(load_secret(key_folder(config, base), agent_id)) if seals_uwb(config) else None
+    seal = UwbSeal(load_secret(key_folder(config, base), agent_id), host_start()) if seals_uwb(config) else None
     tls = tls_settings(config, agent_id, base)
     return SessionSettings(connect=config.device_endpoints(agent_id), tls=tls, uwb_seal=seal)

@@ -30,7 +30,7 @@ from estimators.witness import DECISIVE_NATS, FLOOR_M, UNDERSTATED
 FEWEST_AGENTS = 4
 """Fewer are in one plane, and are their own mirror image."""
 CERTAIN_NATS = 24.0
-"""More evidence than this is not kept: it would only put off that the fleet is found to be the other way round."""
+"""Evidence for the estimate that settles the matter until the fleet comes near a plane again."""
 CREDIT = 0.25
 """Share of an estimate's information that is believed where a fleet is nearly plane: ranges in a plane tell of what
 is across it in the second order only, and a linearisation takes that for more."""
@@ -64,8 +64,12 @@ class FleetMirror:
         """Log odds; negative: the mirror image is the likelier."""
 
     def weigh(self, rows: RowTable, state: Vector, eps: float) -> None:
-        """Use rows ``(m,)`` of one tick, at the estimate ``(6n,)`` of that tick; each row once."""
-        if len(state) >= FEWEST_AGENTS * STATES_PER_AGENT and len(rows):
+        """Use rows ``(m,)`` of one tick, at the estimate ``(6n,)`` of that tick; each row once.
+
+        What was certain stays so until the fleet comes near a plane: it cannot have changed sides. The errors of
+        fixes last, and a minute of them must not add up to another opinion.
+        """
+        if len(state) >= FEWEST_AGENTS * STATES_PER_AGENT and len(rows) and self.lead_nats < CERTAIN_NATS:
             gained = likelihood_ratio(rows, state, state + mirror_offset(state), eps)
             self.lead_nats = min(self.lead_nats + gained, CERTAIN_NATS)
 

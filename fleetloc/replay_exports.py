@@ -18,6 +18,7 @@ from agent.recording import covariance_of, record_chunks
 from estimators.estimator import Estimate, Status
 from estimators.layout import STATES_PER_AGENT, Layout
 from fleetloc import run_files
+from fleetloc.errors import InputError
 from sim_bridge import side_process
 from sim_bridge.replay.comparison import located
 
@@ -29,7 +30,10 @@ TABLE_SUFFIX = ".csv"
 def exporting(
     directory: Path, config: FleetConfig, agents: Sequence[int], start_s: float, epoch_unix_s: float | None
 ) -> Iterator[None]:
-    """Make the files of `export` beside what is done within; there when it ends. Raises `OSError`, `RecordError`."""
+    """Make the files of `export` beside what is done within; there when it ends.
+
+    Raises `OSError`, `RecordError`, and `InputError` where the process that makes them was killed.
+    """
     task = (directory, config, tuple(agents), start_s, epoch_unix_s)
     if not side_process.may_fork():
         export(*task)
@@ -38,7 +42,11 @@ def exporting(
     with side_process.workers(1) as pool:
         done = pool.submit(export, *task)
         yield
-        done.result()
+        try:
+            done.result()
+        except side_process.Killed:
+            expected = "the estimates to be written as CSV and MCAP"
+            raise InputError(str(directory), "", expected, "the writing process was killed") from None
 
 
 def export(

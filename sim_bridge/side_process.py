@@ -10,9 +10,12 @@ import threading
 import warnings
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from multiprocessing.context import ForkContext
 
+Killed = BrokenProcessPool
+"""A copy was killed, by the system for want of memory or by somebody."""
 CONTEXT: ForkContext = multiprocessing.get_context("fork")
 
 
@@ -36,7 +39,20 @@ def ignore_interrupts() -> None:
 
 @contextmanager
 def workers(tasks: int) -> Iterator[ProcessPoolExecutor]:
-    """As many copies as there are tasks or processors; where one is killed, `BrokenProcessPool` is raised."""
+    """As many copies as there are tasks or processors; where one is killed, `Killed` is raised.
+
+    Whatever is raised within ends them at once.
+    """
     count = min(tasks, os.cpu_count() or 1)
     with forking(), ProcessPoolExecutor(count, CONTEXT, initializer=ignore_interrupts) as pool:
-        yield pool
+        before = set(multiprocessing.active_children())
+        try:
+            yield pool
+        except BaseException:
+            copies = set(multiprocessing.active_children()) - before
+            for process in copies:
+                process.terminate()
+            pool.shutdown(cancel_futures=True)
+            for process in copies:
+                process.join()
+            raise

@@ -1,8 +1,9 @@
 """Sealed UWB frames: how an agent on links without TLS knows that ranges come from its own drone's driver.
 
 Layout: magic ``UWBs``, tag of 16 bytes, the frame (`transport.uwb_body`). The tag is keyed BLAKE2b over ``"CLuwb1" 0
-key 0 frame``, with a key that both make of the drone's signing key, which nobody else has. Within their age, frames
-taken down on the way are told from new ones by their numbers (`transport.uwb_body.UwbIntake`).
+host_start 0 key 0 frame``, with a key that both make of the drone's signing key, which nobody else has. So frames of
+an earlier start of the computer are refused; within their age, frames taken down on the way are told from new ones
+by their numbers (`transport.uwb_body.UwbIntake`).
 """
 
 from __future__ import annotations
@@ -28,10 +29,14 @@ def uwb_key(secret: SigningKey) -> bytes:
 
 
 class UwbSeal:
-    """Closes and opens the UWB frames of one drone; ``secret`` is its signing key. Sans-I/O."""
+    """Closes and opens the UWB frames of one drone; ``secret`` is its signing key. Sans-I/O.
 
-    def __init__(self, secret: SigningKey) -> None:
-        self._key = uwb_key(secret)
+    ``host_start`` tells one start of the companion computer, on which driver and daemon run, from another: its
+    monotonic clock, which most frames are stamped with, begins anew, and old frames would be young again.
+    """
+
+    def __init__(self, secret: SigningKey, host_start: bytes = b"") -> None:
+        self._key, self._host_start = uwb_key(secret), host_start
 
     def close(self, key: str, frame: bytes) -> bytes:
         """The sealed frame for a key expression."""
@@ -47,5 +52,5 @@ class UwbSeal:
         return frame
 
     def _tag(self, key: str, frame: bytes) -> bytes:
-        covered = b"".join((_DOMAIN, key.encode(), b"\0", frame))
+        covered = b"".join((_DOMAIN, self._host_start, b"\0", key.encode(), b"\0", frame))
         return hashlib.blake2b(covered, key=self._key, digest_size=TAG_BYTES).digest()

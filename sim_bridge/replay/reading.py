@@ -11,7 +11,6 @@ import marshal
 import pickle
 import traceback
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from contextlib import contextmanager
 from itertools import islice
 from multiprocessing.connection import Connection
@@ -53,7 +52,7 @@ def surveyed(sources: Sequence[LogSource]) -> list[LogSource]:
         try:
             with side_process.workers(len(sources)) as pool:
                 return list(pool.map(_surveyed, sources))
-        except BrokenProcessPool:
+        except side_process.Killed:
             names = ", ".join(names_apart(source.path for source in sources).values())
             raise ReplayError(names, "to be surveyed", "the surveying process was killed") from None
     return [_surveyed(source) for source in sources]
@@ -118,18 +117,22 @@ def _read(receiving: Connection, sending: Connection, feed: Feed) -> None:
 
 def _received(receiving: Connection, feed: Feed) -> Iterator[Arrival]:
     makers = [kind for kind, _ in _FREQUENT]
-    try:
-        while data := receiving.recv_bytes():
-            for arrival_s, agent_id, place, fields in marshal.loads(data):
-                heard = pickle.loads(fields) if place == _PICKLED else makers[place](*fields)
-                yield arrival_s, agent_id, heard
-        end = pickle.loads(receiving.recv_bytes())
-    except EOFError:
-        names = ", ".join(names_apart(vehicle.source.path for vehicle in feed.inputs.plan.vehicles).values())
-        raise ReplayError(names, "to be read to the end", "the reading process was killed") from None
+    while data := _message(receiving, feed):
+        for arrival_s, agent_id, place, fields in marshal.loads(data):
+            heard = pickle.loads(fields) if place == _PICKLED else makers[place](*fields)
+            yield arrival_s, agent_id, heard
+    end = pickle.loads(_message(receiving, feed))
     if isinstance(end, Exception):
         raise end
     feed.absorb(end)
+
+
+def _message(receiving: Connection, feed: Feed) -> bytes:
+    try:
+        return receiving.recv_bytes()
+    except (EOFError, OSError):  # the second in the midst of a message
+        names = ", ".join(names_apart(vehicle.source.path for vehicle in feed.inputs.plan.vehicles).values())
+        raise ReplayError(names, "to be read to the end", "the reading process was killed") from None
 
 
 def _packed(arrival: Arrival) -> tuple[float, int, int, Any]:

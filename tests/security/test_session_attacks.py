@@ -17,7 +17,7 @@ from nacl.signing import SigningKey
 
 from agent.config_tables import FleetConfig
 from agent.radio import Radio
-from agent.security import agent_session, driver_session, observer_session
+from agent.security import agent_session, driver_session, host_start, observer_session
 from tests.security.conftest import MakeFleet
 from tests.support.fleet_process import bound
 from transport.certificate_files import Member, authority_path
@@ -386,7 +386,7 @@ async def test_ranges_that_do_not_come_from_the_drones_own_driver_are_refused_an
         await put_ranges_until(
             stranger, range_frame(1, 777.0), lambda: counted().get("rejected uwb unsigned", 0) > 0
         )
-        foreign = UwbSeal(load_secret(base / config.security.keys, 2))
+        foreign = UwbSeal(load_secret(base / config.security.keys, 2), host_start())
         sealed = foreign.close(key_expression(config.fleet.name, 1, Stream.UWB), range_frame(2, 888.0))
         await put_ranges_until(stranger, sealed, lambda: counted().get("rejected uwb bad_signature", 0) > 0)
         # THEN nothing of it is measured, while the drone's own driver is heard

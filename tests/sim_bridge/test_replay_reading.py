@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import multiprocessing
 import os
+import signal
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -288,6 +289,32 @@ def test_a_log_that_cannot_be_surveyed_is_named() -> None:
 
     with pytest.raises(LogError, match=r"flight\.BIN: expected a vehicle, found none"):
         surveyed([good, Empty(3)])
+
+
+def test_copies_end_at_once_with_what_is_raised_beside_them() -> None:
+    # GIVEN copies at work that would never end
+    def interrupted() -> None:
+        with side_process.workers(2) as pool:
+            for _ in range(2):
+                pool.submit(signal.pause)
+            raise KeyboardInterrupt
+
+    # WHEN the one that waits for them is interrupted
+    with pytest.raises(KeyboardInterrupt):
+        interrupted()
+    # THEN none is left (the fixture looks for them, too)
+    assert not multiprocessing.active_children()
+
+
+def test_a_reader_killed_in_the_midst_of_a_message_is_the_same_clear_error() -> None:
+    # GIVEN a reader that fills its pipe while nobody listens
+    feed = feed_of(MadeLog(200_000))
+    with read_beside(feed) as arrivals:
+        next(arrivals)
+        (reader,) = multiprocessing.active_children()
+        reader.kill()
+        with pytest.raises(ReplayError, match=r"made\.tlog: expected to be read to the end"):
+            list(arrivals)
 
 
 def test_a_survey_that_is_killed_is_one_clear_error() -> None:

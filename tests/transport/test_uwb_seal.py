@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -17,7 +19,8 @@ KEY = "cl/v1/f/agent/001/uwb"
 def test_key_and_tag_are_as_documented() -> None:
     # worked out with hashlib from docs/uwb.md alone
     assert uwb_key(SECRET).hex() == "01e328e4bd09f16b69d8910eaeb34247a4b76ddaf4a7c346f4c545f0d43da42f"
-    assert UwbSeal(SECRET).close(KEY, b"{}") == b"UWBs" + bytes.fromhex("e9bf91605524a3e989cd486274007964") + b"{}"
+    tag = hashlib.blake2b(b"CLuwb1\0start\0" + KEY.encode() + b"\0{}", key=uwb_key(SECRET), digest_size=16).digest()
+    assert UwbSeal(SECRET, b"start").close(KEY, b"{}") == b"UWBs" + tag + b"{}"
 
 
 @given(st.binary(max_size=200))
@@ -44,8 +47,9 @@ def test_no_flipped_bit_passes(frame: bytes, bit: int) -> None:
         (KEY, b"UWBs", Reason.BAD_SIGNATURE),
         (KEY, UwbSeal(SigningKey(bytes(32))).close(KEY, b"frame"), Reason.BAD_SIGNATURE),
         ("cl/v1/f/agent/002/uwb", UwbSeal(SECRET).close(KEY, b"frame"), Reason.BAD_SIGNATURE),
+        (KEY, UwbSeal(SECRET, b"an earlier start").close(KEY, b"frame"), Reason.BAD_SIGNATURE),
     ],
-    ids=["nothing", "no seal", "cut short", "another key", "another drone"],
+    ids=["nothing", "no seal", "cut short", "another key", "another drone", "earlier start"],
 )
 def test_what_our_driver_did_not_seal_is_refused(key: str, data: bytes, reason: Reason) -> None:
     with pytest.raises(Rejected) as refused:

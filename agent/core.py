@@ -31,7 +31,7 @@ from agent.neighbours import NeighbourTable
 from agent.outputs import EstimateReady, HealthChanged, Output, Send, estimate_message
 from agent.record_store import RecordStore
 from agent.records import acceleration_record, gps_records, range_record
-from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
+from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.timeline import TickInput, Timeline, tick_of
 from agent.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.tracking import EstimatorFactory as EstimatorFactory
@@ -89,6 +89,15 @@ class AgentCore:
         self._round = 0
 
     # --- what comes in -------------------------------------------------------------------------------------
+
+    def on_sample(self, sample: Sample, now_s: float) -> None:
+        """A sample of the autopilot's sensors, whichever."""
+        if isinstance(sample, ImuSample):
+            self.on_imu(sample, now_s)
+        elif isinstance(sample, AttitudeSample):
+            self.on_attitude(sample, now_s)
+        elif isinstance(sample, GpsSample):
+            self.on_gps(sample, now_s)
 
     def on_imu(self, sample: ImuSample, now_s: float) -> None:
         """An IMU sample."""

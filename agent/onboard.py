@@ -17,7 +17,6 @@ from agent.inputs import Due, Gone, HouseKept, Input, Journal, MavlinkIn, Packet
 from agent.mavlink_codec import mavlink
 from agent.mavlink_signing import LinkSigning
 from agent.outputs import Output
-from agent.samples import AttitudeSample, GpsSample, ImuSample, Sample
 from agent.uwb import UwbAdapter
 from transport.auth import Trust
 from transport.clock_body import ClockAnswer
@@ -93,7 +92,7 @@ class OnboardAgent:
         self._note(MavlinkIn(host_s, noted, frames), host_s)
         now_s = self.fleet_s(host_s)
         for sample in samples:
-            self._on_sample(sample, now_s)
+            self.core.on_sample(sample, now_s)
         return session.heard > before
 
     def serve_autopilot(self, host_s: float) -> list[bytes]:
@@ -179,11 +178,3 @@ class OnboardAgent:
 
     def _new_core(self) -> AgentCore:
         return AgentCore(self._config, self._agent_id, self._make_estimator)
-
-    def _on_sample(self, sample: Sample, now_s: float) -> None:
-        if isinstance(sample, ImuSample):
-            self.core.on_imu(sample, now_s)
-        elif isinstance(sample, AttitudeSample):
-            self.core.on_attitude(sample, now_s)
-        elif isinstance(sample, GpsSample):
-            self.core.on_gps(sample, now_s)

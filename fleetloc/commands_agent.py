@@ -8,6 +8,7 @@ from typing import Annotated
 import typer
 
 from fleetloc.errors import FleetlocError
+from fleetloc.options import FleetFile, Overrides, Profiles
 
 
 class NotStarted(FleetlocError):
@@ -24,14 +25,10 @@ def register(app: typer.Typer) -> None:
 
 
 def agent(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     agent_id: Annotated[int, typer.Option("--id", help="Which of its agents this is.")],
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     out: Annotated[
         Path | None, typer.Option("--out", help="Write the record here; earlier ones are kept beside it.")
     ] = None,

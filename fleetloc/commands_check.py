@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from fleetloc.options import Overrides, Profiles
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line."""
@@ -15,12 +17,8 @@ def register(app: typer.Typer) -> None:
 
 def check(
     config: Annotated[Path, typer.Argument(help="Configuration of a fleet (TOML).")],
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     agent_id: Annotated[
         int | None, typer.Option("--id", help="Check the keys of this agent only, as its drone would.")
     ] = None,

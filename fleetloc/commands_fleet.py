@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetloc.errors import INTERRUPTED
+from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides, Profiles
 
 if TYPE_CHECKING:
     from agent.config_tables import FleetConfig
@@ -21,19 +22,15 @@ def register(app: typer.Typer) -> None:
 
 
 def fleet(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the world and of injected faults.")] = None,
-    loss: Annotated[float | None, typer.Option("--loss", help="Probability that a packet is lost, 0..1.")] = None,
-    delay_s: Annotated[float | None, typer.Option("--delay", help="Delay of every packet in s.")] = None,
+    loss: Loss = None,
+    delay_s: Delay = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    json_file: FiguresFile = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     lockstep: Annotated[
         bool, typer.Option("--lockstep", help="Virtual time in one process: fast, and the same at every run.")
     ] = False,

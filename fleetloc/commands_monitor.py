@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 import typer
+
+from fleetloc.options import FleetFile, Overrides, Profiles
 
 
 def register(app: typer.Typer) -> None:
@@ -14,13 +15,9 @@ def register(app: typer.Typer) -> None:
 
 
 def monitor(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over the file; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    config: FleetFile,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     connect: Annotated[
         list[str] | None,
         typer.Option("--connect", help="Endpoint to dial instead of those of the file, e.g. tcp/192.168.7.3:7447."),

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides
+
 
 def register(app: typer.Typer) -> None:
     """Add the commands to the command line."""
@@ -36,8 +38,8 @@ def replay(
         list[str] | None,
         typer.Option("--drop-gps", help="ID[:FROM,TO]: no fixes of this drone then; repeatable. 2:-90, = last 90 s."),
     ] = None,
-    loss: Annotated[float | None, typer.Option("--loss", help="Probability that a packet is lost, 0..1.")] = None,
-    delay_s: Annotated[float | None, typer.Option("--delay", help="Delay of every packet in s.")] = None,
+    loss: Loss = None,
+    delay_s: Delay = None,
     estimator: Annotated[
         str | None, typer.Option("--estimator", help="Kind of estimator in place of the file's.")
     ] = None,
@@ -52,11 +54,9 @@ def replay(
     seed: Annotated[
         int | None, typer.Option("--seed", min=0, help="Of synthetic ranges (default: 1) and injected faults.")
     ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    overrides: Overrides = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results; default: out/replay.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
+    json_file: FiguresFile = None,
 ) -> None:
     """Replay flights: what would the fleet have known, how sure, and how does it compare.
 

@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from fleetloc.options import FiguresFile, FleetFile, Overrides, Profiles
+
 LOOK_PERIOD_S = 0.2
 
 
@@ -17,15 +19,11 @@ def register(app: typer.Typer) -> None:
 
 
 def report(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     directory: Annotated[Path, typer.Argument(help="Folder with the simulator's truth and the agents' records.")],
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    json_file: FiguresFile = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     wait_s: Annotated[
         float, typer.Option("--wait", help="Wait at most so many seconds for a run that ends after this began.")
     ] = 0.0,

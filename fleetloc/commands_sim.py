@@ -7,6 +7,8 @@ from typing import Annotated
 
 import typer
 
+from fleetloc.options import FleetFile, Overrides, Profiles
+
 
 def register(app: typer.Typer) -> None:
     """Add the command to the command line."""
@@ -14,16 +16,12 @@ def register(app: typer.Typer) -> None:
 
 
 def sim(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     out: Annotated[Path | None, typer.Option("--out", help="Write the truth here when it ends.")] = None,
     duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Beats sim.seed.")] = None,
-    profiles: Annotated[
-        list[Path] | None, typer.Option("--with", help="TOML laid over it, e.g. a link profile; may be repeated.")
-    ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
     truth_lines: Annotated[
         bool, typer.Option("--truth-lines", hidden=True, help="Write the truth to stdout as it happens.")
     ] = False,

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetloc.errors import FAILED, INTERRUPTED, InputError
+from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides
 
 if TYPE_CHECKING:
     from agent.config_tables import FleetConfig
@@ -24,7 +25,7 @@ def register(app: typer.Typer) -> None:
 
 
 def sitl(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     duration_s: Annotated[
         float | None,
         typer.Option("--duration", help="Seconds; default: until the mission ends, without one sim.duration_s."),
@@ -37,13 +38,11 @@ def sitl(
         typer.Option("--drop-gps", help="ID[:FROM,TO]: no GPS for this daemon, s from the begin; may be repeated."),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the ranges and of injected faults.")] = None,
-    loss: Annotated[float | None, typer.Option("--loss", help="Probability that a packet is lost, 0..1.")] = None,
-    delay_s: Annotated[float | None, typer.Option("--delay", help="Delay of every packet in s.")] = None,
+    loss: Loss = None,
+    delay_s: Delay = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
-    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    json_file: FiguresFile = None,
+    overrides: Overrides = None,
 ) -> None:
     """Attach a daemon to each running simulator, range by its ground truth, fly a mission if asked, and report.
 
@@ -144,7 +143,7 @@ def _fly(folder: Path, duration_s: float | None) -> tuple[FleetConfig, SitlRun]:
 
 
 def sitl_bridge(
-    config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")],
+    config: FleetFile,
     out: Annotated[Path | None, typer.Option("--out", help="Write the truth here when it ends.")] = None,
 ) -> None:
     """Stand between running simulators and daemons that are started by somebody else; SIGTERM and SIGINT end it.
@@ -173,7 +172,7 @@ def sitl_bridge(
         write_json(out / SIMULATOR_JSON, dataclasses.asdict(report))
 
 
-def sitl_mission(config: Annotated[Path, typer.Argument(help="Configuration of the fleet (TOML).")]) -> None:
+def sitl_mission(config: FleetFile) -> None:
     """Fly the mission of [sitl] through a running bridge; what happens goes to stdout."""
     import asyncio
 

@@ -162,7 +162,7 @@ class FleetLockstep:
         now_s = self._fleet.fleet_s
         for agent_id, sample in sensed.samples:
             if agent_id in self._members:
-                self._members[agent_id].on_sample(sample, now_s)
+                self._members[agent_id].core.on_sample(sample, now_s)
         for agent_id, message in sensed.fixes:
             member = self._members.get(agent_id)
             if isinstance(member, ValueMember):

@@ -11,7 +11,6 @@ from agent.core import AgentCore, EstimatorFactory
 from agent.frames import FleetFrame
 from agent.mavlink_samples import SampleAdapter
 from agent.radio_faults import channel_settings
-from agent.samples import AttitudeSample, GpsSample, ImuSample, Sample
 from agent.uwb import UwbAdapter
 from transport.auth import UNSIGNED
 from transport.channel import Channel, Outage
@@ -69,15 +68,6 @@ class Member(ABC):
     def counters(self) -> dict[str, int]:
         """Those counters of a daemon that have a meaning here."""
 
-    def on_sample(self, sample: Sample, now_s: float) -> None:
-        """A sample of the autopilot's sensors; ``now_s`` fleet time."""
-        if isinstance(sample, ImuSample):
-            self.core.on_imu(sample, now_s)
-        elif isinstance(sample, AttitudeSample):
-            self.core.on_attitude(sample, now_s)
-        elif isinstance(sample, GpsSample):
-            self.core.on_gps(sample, now_s)
-
     def _common_counters(self) -> dict[str, int]:
         counters = {"injected losses": sum(self.channel.lost.values()), **self.core.counters}
         for prefix, table in (
@@ -132,7 +122,7 @@ class ValueMember(ObjectMember):
         """A GPS_RAW_INT message; ``now_s`` fleet time."""
         sample = self._samples.convert(message, now_s)
         if sample is not None:
-            self.on_sample(sample, now_s)
+            self.core.on_sample(sample, now_s)
 
     def on_uwb(self, frame: UwbFrame, age_s: float, now_s: float) -> None:
         """A frame of the own UWB module; ``now_s`` fleet time."""
@@ -170,7 +160,7 @@ class ByteMember(Member):
     def on_mavlink(self, data: bytes, host_s: float) -> None:
         """A datagram of the autopilot."""
         for sample in self._session.receive(data, host_s):
-            self.on_sample(sample, host_s + self._fleet_offset_s)
+            self.core.on_sample(sample, host_s + self._fleet_offset_s)
 
     def to_autopilot(self, host_s: float) -> list[bytes]:
         """Frames due on the autopilot's link."""

@@ -23,9 +23,9 @@ from sim_bridge.logs.events import (
     SystemSurvey,
 )
 from sim_bridge.logs.files import opened
-from sim_bridge.logs.frames import frame_about
 from sim_bridge.logs.gps_time import GpsTimeFit, unix_of_week
 from sim_bridge.logs.stamps import StampRepair, without_outliers
+from sim_bridge.logs.surveyed import SurveyedLog
 
 _SYSTEM_ID_PARAMETERS = ("SYSID_THISMAV", "MAV_SYSID")
 """The MAVLink system id, by its old and its new name."""
@@ -60,29 +60,14 @@ class _Found:
     gps_time: GpsTimeFit = field(default_factory=GpsTimeFit)
 
 
-class DataflashSource:
+class DataflashSource(SurveyedLog):
     """A `LogSource` over a dataflash log, plain or gzip."""
 
     format: Format = "dataflash"
 
     def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        self.path = path
-        self._given_frame = frame
-        self._sensors = sensors
-        self._survey: LogSurvey | None = None
+        super().__init__(path, frame, sensors)
         self._sim_home: GeodeticPoint | None = None
-        self.counts = LogCounts()
-
-    @property
-    def frame(self) -> FleetFrame:
-        """The frame given, else one about the first origin, home or fix of the log."""
-        return self._given_frame or frame_about(self.survey().systems.values())
-
-    def survey(self) -> LogSurvey:
-        """One pass over the log; raises `LogError` if no record with a time is in it."""
-        if self._survey is None:
-            self._survey = self._made_survey()
-        return self._survey
 
     def events(self) -> Iterator[LogEvent]:
         """The samples in the order of the log."""

@@ -30,10 +30,10 @@ from sim_bridge.logs.events import (
     UnixZero,
 )
 from sim_bridge.logs.files import opened
-from sim_bridge.logs.frames import frame_about
 from sim_bridge.logs.mavlink_frames import Frame, FrameReader, decoded
 from sim_bridge.logs.mavlink_vehicle import ESTIMATES, TRUTHS, LoggedVehicle
 from sim_bridge.logs.stamps import StampRepair, without_outliers
+from sim_bridge.logs.surveyed import SurveyedLog
 
 _NAMED = {
     message_id: mavlink.mavlink_map[message_id].msgname
@@ -95,7 +95,7 @@ class _Heard:
     first_fix: GeodeticPoint | None = None
 
 
-class TlogSource:
+class TlogSource(SurveyedLog):
     """A `LogSource` over a ``.tlog``, plain or gzip.
 
     A vehicle is every system with a heartbeat of an autopilot; where no heartbeat was recorded at all, every
@@ -105,25 +105,10 @@ class TlogSource:
     format: Format = "tlog"
 
     def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        self.path = path
-        self._given_frame = frame
-        self._sensors = sensors
-        self._survey: LogSurvey | None = None
+        super().__init__(path, frame, sensors)
         self._sources: dict[int, Source] = {}
         self._clocks: dict[int, BootClock] = {}
         self._clock_notes: Counter[str] = Counter()
-        self.counts = LogCounts()
-
-    @property
-    def frame(self) -> FleetFrame:
-        """The frame given, else one about the first origin, home or fix of the log."""
-        return self._given_frame or frame_about(self.survey().systems.values())
-
-    def survey(self) -> LogSurvey:
-        """One pass over the log; raises `LogError` if it holds no vehicle."""
-        if self._survey is None:
-            self._survey = self._made_survey()
-        return self._survey
 
     def events(self) -> Iterator[LogEvent]:
         """The samples of all vehicles in order of arrival."""

@@ -23,8 +23,8 @@ from sim_bridge.logs.events import (
     SystemSurvey,
     UnixZero,
 )
-from sim_bridge.logs.frames import frame_about
 from sim_bridge.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted
+from sim_bridge.logs.surveyed import SurveyedLog
 from sim_bridge.logs.ulog_samples import (
     GPS_TOPICS,
     WANTED,
@@ -45,30 +45,15 @@ TIMESYNC_SIGMA_S = 0.01
 _FIX_3D = 3
 
 
-class UlogSource:
+class UlogSource(SurveyedLog):
     """A `LogSource` over a PX4 log, plain or gzip. Its tables stay in memory between survey and events."""
 
     format: Format = "ulog"
 
     def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        self.path = path
-        self._given_frame = frame
-        self._sensors = sensors
+        super().__init__(path, frame, sensors)
         self._loaded: Tables | None = None
         self._damage: Counter[str] = Counter()
-        self._survey: LogSurvey | None = None
-        self.counts = LogCounts()
-
-    @property
-    def frame(self) -> FleetFrame:
-        """The frame given, else one about the first origin or fix of the log."""
-        return self._given_frame or frame_about(self.survey().systems.values())
-
-    def survey(self) -> LogSurvey:
-        """Reads the file; raises `LogError` if it holds no topic of interest."""
-        if self._survey is None:
-            self._survey = self._made_survey()
-        return self._survey
 
     def events(self) -> Iterator[LogEvent]:
         """The samples of all topics, merged by the time of their publication."""

@@ -132,7 +132,7 @@ class Replay:
         if agent_id in self._left:
             self._counts.ranges["sample after its log's end"] += 1
             return
-        self.members[agent_id].on_sample(sample, self._queue.now_s)
+        self.members[agent_id].core.on_sample(sample, self._queue.now_s)
 
     def _on_range(self, line: RangeLine) -> None:
         """Hand a range to its observer as its UWB module would."""

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+import socket
 import tomllib
 from collections import defaultdict
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -18,6 +20,7 @@ from agent.mavlink_codec import Decoder, Encoder, mavlink
 from agent.outputs import EstimateReady, HealthChanged, Output, Send
 from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
 from estimators.factory import make_estimator
+from tests.support.ports import HOST, free_ports
 from transport.auth import UNSIGNED
 from transport.opening import Opener
 from transport.sealing import Sealer
@@ -236,3 +239,20 @@ def virtual_fleet() -> type[VirtualFleet]:
 @pytest.fixture
 def virtual_autopilot() -> type[VirtualAutopilot]:
     return VirtualAutopilot
+
+
+@pytest.fixture
+def config_of(make_config: Callable[..., FleetConfig], tmp_path: Path) -> Callable[..., FleetConfig]:
+    """A fleet on free ports, whose agents start at once."""
+
+    def make(count: int, *overrides: str) -> FleetConfig:
+        udp, tcp = free_ports(socket.SOCK_DGRAM, count), free_ports(socket.SOCK_STREAM, count)
+        own: list[str] = ["initial.position_m=[0.0, 0.0, -5.0]", f"record.directory={tmp_path / 'rec'}"]
+        for i in range(count):
+            own.append(f"agents.{i + 1}.mavlink=udpin:{HOST}:{udp[i]}")
+            own.append(f'agents.{i + 1}.listen=["tcp/{HOST}:{tcp[i]}"]')
+        if count > 1:
+            own.append(f'agents.2.connect=["tcp/{HOST}:{tcp[0]}"]')
+        return make_config(count, *own, *overrides)
+
+    return make

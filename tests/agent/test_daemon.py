@@ -4,29 +4,26 @@ from __future__ import annotations
 
 import asyncio
 import json
-import logging
 import os
 import signal
 import socket
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from agent.config import dump
-from agent.config_tables import FleetConfig
-from agent.daemon import Daemon, run
+from agent.daemon import Daemon
 from agent.exit_codes import ExitCode
-from agent.logs import configure_logging
 from agent.mavlink_codec import Encoder, mavlink
 from agent.observers import DaemonState, Observer
 from agent.recording import read_record
 from estimators.estimator import Status
 from estimators.factory import make_estimator
+from tests.support.ports import HOST
 from transport.auth import UNSIGNED
 from transport.estimate_body import FleetEstimate
 from transport.keys import init_keys
@@ -36,113 +33,7 @@ from transport.session import Handlers, open_session
 from transport.session_settings import SessionSettings
 from transport.streams import Stream
 
-HOST = "127.0.0.1"
 PATIENCE_S = 30.0
-
-
-@contextmanager
-def bound(kind: int) -> Iterator[int]:
-    """A port that is taken."""
-    with socket.socket(socket.AF_INET, kind) as taken:
-        taken.bind((HOST, 0))
-        if kind == socket.SOCK_STREAM:
-            taken.listen()
-        yield taken.getsockname()[1]
-
-
-def free_ports(kind: int, count: int) -> list[int]:
-    with ExitStack() as stack:
-        return [stack.enter_context(bound(kind)) for _ in range(count)]
-
-
-@pytest.fixture
-def config_of(make_config: Callable[..., FleetConfig], tmp_path: Path) -> Callable[..., FleetConfig]:
-    """A fleet on free ports, whose agents start at once."""
-
-    def make(count: int, *overrides: str) -> FleetConfig:
-        udp, tcp = free_ports(socket.SOCK_DGRAM, count), free_ports(socket.SOCK_STREAM, count)
-        own: list[str] = ["initial.position_m=[0.0, 0.0, -5.0]", f"record.directory={tmp_path / 'rec'}"]
-        for i in range(count):
-            own.append(f"agents.{i + 1}.mavlink=udpin:{HOST}:{udp[i]}")
-            own.append(f'agents.{i + 1}.listen=["tcp/{HOST}:{tcp[i]}"]')
-        if count > 1:
-            own.append(f'agents.2.connect=["tcp/{HOST}:{tcp[0]}"]')
-        return make_config(count, *own, *overrides)
-
-    return make
-
-
-# --- ends ----------------------------------------------------------------------------------------------------
-
-
-def expect_exit(
-    config: FleetConfig, agent_id: int, caplog: pytest.LogCaptureFixture, base: Path = Path()
-) -> tuple[ExitCode, str]:
-    """The exit code, and the one line that explains it."""
-    with caplog.at_level(logging.ERROR, "fleetloc.agent"):
-        code = run(config, agent_id, make_estimator, base=base)
-    assert len(caplog.messages) == 1
-    assert "\n" not in caplog.messages[0]
-    return code, caplog.messages[0]
-
-
-def test_an_unknown_id_is_a_configuration_error(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
-    code, line = expect_exit(config_of(2), 7, caplog)
-    assert code is ExitCode.CONFIG
-    assert "expected one of 1, 2, found 7" in line
-
-
-def test_a_taken_mavlink_port(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
-    with bound(socket.SOCK_DGRAM) as port:
-        code, line = expect_exit(config_of(1, f"agents.1.mavlink=udpin:{HOST}:{port}"), 1, caplog)
-    assert code is ExitCode.LINK
-    assert f"udpin:{HOST}:{port}: cannot be opened" in line
-
-
-def test_a_taken_session_port(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
-    with bound(socket.SOCK_STREAM) as port:
-        code, line = expect_exit(config_of(1, f'agents.1.listen=["tcp/{HOST}:{port}"]'), 1, caplog)
-    assert code is ExitCode.SESSION
-    assert f"tcp/{HOST}:{port}" in line
-
-
-def test_missing_keys(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    code, line = expect_exit(config_of(1, "security.mode=signed"), 1, caplog, tmp_path)
-    assert code is ExitCode.KEYS
-    assert str(tmp_path / "keys") in line
-    assert "fleetloc keys" in line
-
-
-def test_a_record_that_cannot_be_written(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    code, line = expect_exit(config_of(1, f"record.directory={tmp_path / 'file'}"), 1, caplog)
-    assert code is ExitCode.RECORD
-    assert "cannot be written" in line
-
-
-def test_an_autopilot_that_never_appears(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
-    code, line = expect_exit(config_of(1, "mavlink.appear_timeout_s=0.2", "fleet.period_s=1.0"), 1, caplog)
-    assert code is ExitCode.NO_AUTOPILOT
-    assert "expected heartbeats of an autopilot (auto) with system id 1 within 0.2 s, found nothing" in line
-
-
-def test_log_lines_go_to_stderr_quiet_unless_asked(capsys: pytest.CaptureFixture[str]) -> None:
-    logger = logging.getLogger("fleetloc")
-    before = (logger.handlers[:], logger.level, logger.propagate)
-    try:
-        configure_logging(0)
-        logging.getLogger("fleetloc.agent").info("a state")
-        configure_logging(1)
-        logging.getLogger("fleetloc.agent").info("a change")
-        out, err = capsys.readouterr()
-    finally:
-        logger.handlers[:], logger.level, logger.propagate = before
-    assert out == ""
-    assert "a change" in err
-    assert "a state" not in err
-
-
-# --- life ----------------------------------------------------------------------------------------------------
 
 
 class UdpAutopilot(asyncio.DatagramProtocol):

@@ -21,7 +21,7 @@ from agent.metrics import Metrics, families
 from agent.observers import DaemonState
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, Status
-from tests.support.fleet_process import bound
+from tests.support.ports import bound
 
 COUNTERS = {
     "ticks": 40,

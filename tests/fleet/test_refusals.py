@@ -13,7 +13,8 @@ import pytest
 from agent.exit_codes import ExitCode
 from fleetloc import cli
 from fleetloc.errors import BAD_INPUT, REFUSED
-from tests.support.fleet_process import HOST, LINE3, ROOT, FleetProcess, bound, on_free_ports, with_overrides
+from tests.support.fleet_process import LINE3, ROOT, FleetProcess, on_free_ports, with_overrides
+from tests.support.ports import HOST, bound
 
 Start = Callable[..., FleetProcess]
 

@@ -21,8 +21,9 @@ from fleetloc.cli import main
 from sim_bridge.sitl_mission import load_mission
 from sim_bridge.sitl_setup import vehicle_links
 from sim_bridge.truth import load_truth
-from tests.support.fleet_process import PATIENCE_S, ROOT, bound, processes_with
+from tests.support.fleet_process import PATIENCE_S, ROOT, processes_with
 from tests.support.loopback_sitl import FRAME, flavour_of
+from tests.support.ports import bound
 
 IDS = (1, 2, 3)
 BOUND_M = 0.15

@@ -22,7 +22,8 @@ from fleetloc.errors import EnvironmentFault
 from fleetloc.monitor.web import MAX_VIEWERS, Board, WebServer, page
 from tests.support import chromium
 from tests.support.beacon import ROOT, beacons
-from tests.support.fleet_process import bound, until
+from tests.support.fleet_process import until
+from tests.support.ports import bound
 
 PATIENCE_S = 60.0
 LOST_WITHIN_S = 3.0

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import gzip
 import json
+import os
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +14,12 @@ import pytest
 from mcap.reader import make_reader
 
 from agent.config import load_config
+from fleetloc import replay_exports
 from fleetloc.cli import main
+from fleetloc.errors import InputError
 from fleetloc.range_study import pair_figures
 from fleetloc.replay_setup import split_truth
+from sim_bridge import side_process
 from sim_bridge.replay.range_files import RangeCounts
 from sim_bridge.replay.recorded_ranges import ranges_of_record
 from tests.support.logs import LOGS
@@ -132,6 +136,20 @@ def test_times_count_from_the_start_of_the_logs_whatever_part_is_replayed(tmp_pa
     dropped = figures["agents"][1]["counters"]["skipped gps: dropped on request"]
     assert fixes[0] == fixes[1] + dropped > fixes[1] > 0 < dropped
     assert all(log["used"]["1"]["imu"] > 100 for log in figures["logs"])
+
+
+def _killed(*_arguments: object) -> None:
+    os._exit(9)
+
+
+def test_an_export_that_is_killed_is_one_clear_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(replay_exports, "export", _killed)
+    monkeypatch.setattr(side_process, "may_fork", lambda: True)
+    with (
+        pytest.raises(InputError, match="expected the estimates to be written as CSV and MCAP, found the writing"),
+        replay_exports.exporting(tmp_path, load_config(CONFIGS / "line3.toml"), (1,), 0.0, None),
+    ):
+        pass
 
 
 def test_a_log_of_another_format_is_compared_with_its_autopilot(

@@ -27,7 +27,7 @@ from fleetloc.ros2_odometry import (
     topic_key,
 )
 from tests.support.beacon import fleet_estimate
-from tests.support.fleet_process import bound
+from tests.support.ports import bound
 
 GOLDEN = json.loads((Path(__file__).parents[1] / "data" / "ros2" / "odometry.json").read_text())
 HASH = "RIHS01_3cc97dc7fb7502f8714462c526d369e35b603cfc34d946e3f2eda2766dfec6e0"

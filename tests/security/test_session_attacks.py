@@ -19,7 +19,7 @@ from agent.config_tables import FleetConfig
 from agent.radio import Radio
 from agent.security import agent_session, driver_session, host_start, observer_session
 from tests.security.conftest import MakeFleet
-from tests.support.fleet_process import bound
+from tests.support.ports import bound
 from transport.certificate_files import Member, authority_path
 from transport.certificates import issue, make_authority
 from transport.clock_body import ClockAnswer, decode_clock_question

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -16,6 +15,7 @@ from agent.endpoints import parse_endpoint
 from sim_bridge.scenario import Interval, Scenario, Vehicle
 from sim_bridge.simulation import Simulation
 from sim_bridge.simulator import Simulator
+from tests.support.ports import free_port
 
 mavsdk = pytest.importorskip("mavsdk.asyncio", reason="the MAVSDK client is not installed: its tests are skipped")
 from mavsdk import logging as mavsdk_logging  # noqa: E402
@@ -28,12 +28,6 @@ BOTH = pytest.mark.parametrize("flavour", ["px4", "ardupilot"])
 WAIT_S = 10.0
 """Bound of every wait for an event; nothing waits for a time to pass."""
 RUN_S = 60.0
-
-
-def free_port() -> int:
-    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @asynccontextmanager

@@ -21,18 +21,13 @@ from sim_bridge.simulation import Simulation
 from sim_bridge.simulator import Simulator, simulate, stop_signals
 from sim_bridge.truth import load_truth
 from sim_bridge.udp_autopilot import MAX_DATAGRAM_BYTES, PortError, open_port
+from tests.support.ports import free_port
 from transport.session import Handlers, open_session
 from transport.session_settings import SessionSettings
 from transport.streams import Stream
 from transport.uwb_body import UwbIntake
 
 WAIT_S = 10.0
-
-
-def free_port(kind: int = socket.SOCK_DGRAM) -> int:
-    with socket.socket(socket.AF_INET, kind) as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 class Daemon(asyncio.DatagramProtocol):

@@ -21,8 +21,8 @@ from sim_bridge.sitl_setup import vehicle_links
 from sim_bridge.sitl_world import SitlWorld
 from sim_bridge.truth import load_truth
 from sim_bridge.udp_autopilot import PortError
-from tests.support.fleet_process import bound
 from tests.support.loopback_sitl import FRAME, LoopbackSitl, flavour_of, grounded_fleet
+from tests.support.ports import bound
 from transport.session import Handlers, open_session
 from transport.session_settings import SessionSettings
 from transport.streams import Stream

@@ -8,37 +8,25 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from tests.support.ports import HOST, free_ports
+
 ROOT = Path(__file__).parents[2]
 LINE3 = ROOT / "configs" / "line3.toml"
-HOST = "127.0.0.1"
 PATIENCE_S = 300.0
 """A first start compiles kernels."""
 POLL_S = 0.05
 
 
-@contextmanager
-def bound(kind: int) -> Iterator[int]:
-    """A port that is taken."""
-    with socket.socket(socket.AF_INET, kind) as taken:
-        taken.bind((HOST, 0))
-        if kind == socket.SOCK_STREAM:
-            taken.listen()
-        yield taken.getsockname()[1]
-
-
 def on_free_ports(count: int) -> list[str]:
     """Overrides that move a fleet with ids from 1 to ports that nobody uses."""
-    with ExitStack() as stack:
-        udp = [stack.enter_context(bound(socket.SOCK_DGRAM)) for _ in range(count)]
-        tcp = [stack.enter_context(bound(socket.SOCK_STREAM)) for _ in range(count)]
+    udp, tcp = free_ports(socket.SOCK_DGRAM, count), free_ports(socket.SOCK_STREAM, count)
     moved = [f"agents.{i + 1}.mavlink=udpin:{HOST}:{port}" for i, port in enumerate(udp)]
     return moved + [f'agents.{i + 1}.listen=["tcp/{HOST}:{port}"]' for i, port in enumerate(tcp)]
 

@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import zenoh
 
+from tests.support.ports import free_port
 from transport.session import Handlers, Session, open_session
 from transport.session_settings import SessionSettings, TlsSettings, zenoh_config
 from transport.streams import Stream, key_expression
@@ -48,20 +49,13 @@ def make_member(directory: Path, authority: str, agent_id: int, file: str) -> Tl
     return TlsSettings(*paths)
 
 
-def free_port() -> int:
-    with socket.socket() as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
-
-
 async def test_members_put_on_their_own_keys_only_and_strangers_stay_out(tmp_path: Path) -> None:
     # GIVEN a fleet with an authority, agent 1 that listens, and another authority nobody knows
     for authority in ("fleet", "rogue"):
         make_authority(tmp_path, authority)
     tls = {agent_id: make_member(tmp_path, "fleet", agent_id, f"a{agent_id}") for agent_id in (1, 2)}
     stranger_tls = make_member(tmp_path, "rogue", 3, "rogue3")
-    endpoint = f"tls/127.0.0.1:{free_port()}"
+    endpoint = f"tls/127.0.0.1:{free_port(socket.SOCK_STREAM)}"
     samples: asyncio.Queue[tuple[str, bytes]] = asyncio.Queue()
     sessions: list[Session] = []
     here = asyncio.Event()

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from nacl.signing import SigningKey
 
+from tests.support.ports import free_ports
 from transport.clock_body import (
     ClockAnswer,
     decode_clock_question,
@@ -33,14 +34,6 @@ from transport.uwb_body import UwbFrame, UwbRange, decode_uwb, encode_uwb_json
 FLEET, BOUND_S = "loopback", 15.0
 SECRETS = {agent_id: SigningKey(bytes([agent_id]) * 32) for agent_id in (1, 2, 3)}
 TRUST = {agent_id: (secret.verify_key,) for agent_id, secret in SECRETS.items()}
-
-
-def free_ports(count: int) -> list[int]:
-    with contextlib.ExitStack() as stack:
-        sockets = [stack.enter_context(socket.socket()) for _ in range(count)]
-        for one in sockets:
-            one.bind(("127.0.0.1", 0))
-        return [one.getsockname()[1] for one in sockets]
 
 
 class Node:
@@ -95,7 +88,7 @@ class Node:
 async def fleet(size: int, streams: Sequence[Stream], **settings: Any) -> AsyncIterator[list[Node]]:
     """Agents 1..size, all neighbours, each listening to the streams of all others and seeing them."""
     ids = range(1, size + 1)
-    ports = dict(zip(ids, free_ports(size), strict=True))
+    ports = dict(zip(ids, free_ports(socket.SOCK_STREAM, size), strict=True))
     nodes = [Node(agent_id, ports, **settings) for agent_id in ids]
     try:
         for node in nodes:
@@ -149,7 +142,7 @@ async def test_three_agents_exchange_measurements_and_consensus_rounds() -> None
 
 async def test_a_stream_and_a_datagram_link_to_one_neighbour() -> None:
     # GIVEN two agents joined by a TCP link for what is reliable and a UDP link for the rest
-    tcp, udp = free_ports(2)
+    tcp, udp = free_ports(socket.SOCK_STREAM, 2)
     endpoints = (f"tcp/127.0.0.1:{tcp}?rel=1", f"udp/127.0.0.1:{udp}?rel=0")
     one, two = Node(1, {}), Node(2, {})
     one.settings, two.settings = SessionSettings(listen=endpoints), SessionSettings(connect=endpoints)
@@ -217,7 +210,7 @@ async def test_the_clock_of_a_neighbour_is_asked_and_the_answer_is_signed() -> N
 
 
 async def test_a_uwb_driver_feeds_its_agent_and_an_observer_watches() -> None:
-    (port,) = free_ports(1)
+    (port,) = free_ports(socket.SOCK_STREAM, 1)
     agent, driver = Node(1, {1: port}), Node(None, {1: port})
     try:
         await agent.start([(1, Stream.UWB)])
@@ -240,7 +233,7 @@ async def test_a_uwb_driver_feeds_its_agent_and_an_observer_watches() -> None:
 
 async def test_a_flood_is_shed_and_counted_and_what_follows_arrives() -> None:
     # GIVEN an agent with room for 64 packets, whose event loop is busy while more garbage comes than that
-    (port,) = free_ports(1)
+    (port,) = free_ports(socket.SOCK_STREAM, 1)
     agent, attacker = Node(1, {1: port}, inbox_packets=64), Node(None, {1: port})
     try:
         await agent.start([(2, Stream.INFO), (2, Stream.MEAS)])
@@ -272,7 +265,7 @@ async def test_a_flood_is_shed_and_counted_and_what_follows_arrives() -> None:
 
 
 async def test_a_failing_handler_stops_nothing() -> None:
-    (port,) = free_ports(1)
+    (port,) = free_ports(socket.SOCK_STREAM, 1)
     agent, other = Node(1, {1: port}), Node(None, {1: port})
     failures: list[dict[str, Any]] = []
     asyncio.get_running_loop().set_exception_handler(lambda _loop, context: failures.append(context))
@@ -311,7 +304,7 @@ async def test_a_taken_port_is_one_clear_error() -> None:
 
 async def test_an_absent_neighbour_does_not_hold_up_the_start() -> None:
     # GIVEN agent 2 that dials agent 1, which comes up later
-    ports = dict(zip((1, 2), free_ports(2), strict=True))
+    ports = dict(zip((1, 2), free_ports(socket.SOCK_STREAM, 2), strict=True))
     one, two = Node(1, ports), Node(2, ports)
     try:
         await two.start([(1, Stream.MEAS)])

@@ -10,18 +10,12 @@ from typing import cast
 
 import pytest
 
+from tests.support.ports import free_port
 from transport.session import Handlers, Session, open_session
 from transport.session_settings import SessionSettings
 from transport.streams import Stream, key_expression
 
 FLEET, BOUND_S, POLL_S = "links", 15.0, 0.01
-
-
-def free_port(kind: socket.SocketKind) -> int:
-    with socket.socket(socket.AF_INET, kind) as one:
-        one.bind(("127.0.0.1", 0))
-        port: int = one.getsockname()[1]
-        return port
 
 
 class Node:

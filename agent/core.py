@@ -23,25 +23,25 @@ from enum import Enum, auto
 
 import numpy as np
 
-from agent.config_tables import FleetConfig
-from agent.frames import gravity_mps2
-from agent.health import Facts, HealthMonitor, gps_lost
-from agent.latency import GpsLatency
-from agent.neighbours import NeighbourTable
+from agent.config.tables import FleetConfig
+from agent.fleet.neighbours import NeighbourTable
+from agent.fleet.record_store import RecordStore
+from agent.fleet.records import acceleration_record, gps_records, range_record
+from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
+from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
+from agent.fleet.tracking import FleetTracker, in_layout
 from agent.outputs import EstimateReady, HealthChanged, Output, Send, estimate_message
-from agent.record_store import RecordStore
-from agent.records import acceleration_record, gps_records, range_record
-from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
-from agent.timeline import TickInput, Timeline, tick_of
-from agent.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
-from agent.tracking import EstimatorFactory as EstimatorFactory
-from agent.tracking import FleetTracker, in_layout
+from agent.sensing.frames import gravity_mps2
+from agent.sensing.latency import GpsLatency
+from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
+from agent.sensing.timeline import TickInput, Timeline, tick_of
+from agent.watch.health import Facts, HealthMonitor, gps_lost
 from estimators.estimator import Estimate
-from estimators.layout import Layout, block
-from transport.information_body import Information
-from transport.measurement_body import Measurements, Record
-from transport.opening import Received
-from transport.rounds import RoundBarrier
+from estimators.model.layout import Layout, block
+from transport.link.rounds import RoundBarrier
+from transport.messages.information_body import Information
+from transport.messages.measurement_body import Measurements, Record
+from transport.security.opening import Received
 
 MAX_BEHIND_TICKS = 50
 """Further behind (a suspended computer, a clock set forward), the ticks between are left out."""

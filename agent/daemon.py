@@ -15,10 +15,21 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from agent.autopilot import LinkState
-from agent.config_tables import FleetConfig
+from agent.config.endpoints import parse_endpoint
+from agent.config.tables import FleetConfig
 from agent.core import ESTIMATOR_FAULTS, AgentCore, EstimatorFactory
-from agent.diagnostics import (
+from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
+from agent.exit_codes import ExitCode
+from agent.log.run_record import RunRecord
+from agent.mavlink.link import create_link
+from agent.mavlink.session import LinkState
+from agent.mavlink.signing_stamps import StampKeeper
+from agent.onboard import OnboardAgent
+from agent.outputs import EstimateReady, HealthChanged, Output, Send
+from agent.radio.radio import Radio
+from agent.radio.security import mavlink_signing, stamp_file
+from agent.warmup import warm_up
+from agent.watch.diagnostics import (
     ProcessUse,
     TickTimes,
     counters_of,
@@ -26,19 +37,8 @@ from agent.diagnostics import (
     gauges_of,
     neighbour_gauges,
 )
-from agent.endpoints import parse_endpoint
-from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
-from agent.exit_codes import ExitCode
-from agent.faults import ProgramFaults
-from agent.mavlink_link import create_link
-from agent.mavlink_stamps import StampKeeper
-from agent.observers import DaemonState, Observer
-from agent.onboard import OnboardAgent
-from agent.outputs import EstimateReady, HealthChanged, Output, Send
-from agent.radio import Radio
-from agent.run_record import RunRecord
-from agent.security import mavlink_signing, stamp_file
-from agent.warmup import warm_up
+from agent.watch.faults import ProgramFaults
+from agent.watch.observers import DaemonState, Observer
 from transport.errors import KeyFileError, SessionError, SettingsError, UnwritableError
 
 LOG = logging.getLogger("fleetloc.agent")

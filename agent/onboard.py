@@ -7,20 +7,20 @@ monotonic clock; fleet time follows from it and the fleet clock.
 
 from __future__ import annotations
 
-from agent.autopilot import AutopilotSession
-from agent.clock import FleetClock, clock_fault
-from agent.config_tables import FleetConfig
+from agent.config.endpoints import LinkKind, parse_endpoint
+from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
-from agent.endpoints import LinkKind, parse_endpoint
-from agent.health import State
 from agent.inputs import Due, Gone, HouseKept, Input, Journal, MavlinkIn, PacketIn, Served, UwbIn
-from agent.mavlink_codec import mavlink
-from agent.mavlink_signing import LinkSigning
+from agent.mavlink.codec import mavlink
+from agent.mavlink.session import AutopilotSession
+from agent.mavlink.signing import LinkSigning
 from agent.outputs import Output
-from agent.uwb import UwbAdapter
-from transport.auth import Trust
-from transport.clock_body import ClockAnswer
-from transport.opening import Opener
+from agent.sensing.clock import FleetClock, clock_fault
+from agent.uwb.adapter import UwbAdapter
+from agent.watch.health import State
+from transport.messages.clock_body import ClockAnswer
+from transport.security.auth import Trust
+from transport.security.opening import Opener
 
 SYSTEM_STATUS = {
     State.INIT: mavlink.MAV_STATE_BOOT,

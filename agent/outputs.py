@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from agent.health import Health
+from agent.watch.health import Health
 from estimators.estimator import Estimate
-from transport.estimate_body import MAX_AGE_TICKS, FleetEstimate
-from transport.information_body import Information
-from transport.measurement_body import Measurements
+from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate
+from transport.messages.information_body import Information
+from transport.messages.measurement_body import Measurements
 
 
 @dataclass(frozen=True, slots=True)

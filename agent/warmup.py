@@ -4,10 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.core import ESTIMATOR_FAULTS, EstimatorFactory
-from estimators.layout import STATES_PER_AGENT, Layout, position
-from estimators.measurements import RowTable, input_rows, position_rows, range_row, speed_row
+from estimators.model.layout import STATES_PER_AGENT, Layout, position
+from estimators.model.measurements import RowTable, input_rows, position_rows, range_row, speed_row
 
 TICKS = 3
 SPACING_M = 10.0

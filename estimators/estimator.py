@@ -10,8 +10,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.layout import Layout
-from estimators.measurements import InputTable, Matrix, RowTable, Vector
+from estimators.model.layout import Layout
+from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 
 
 class Status(IntEnum):

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from estimators.estimator import Estimator
-from estimators.layout import Layout
-from estimators.measurements import Matrix, Vector
+from estimators.model.layout import Layout
+from estimators.model.measurements import Matrix, Vector
 from estimators.settings import EstimatorSettings
 
 
@@ -22,17 +22,17 @@ def make_estimator(
     """
     # each algorithm is imported where it is asked for: a daemon loads the kernels of one
     if settings.kind in ("dmhe_pre_ekf", "dmhe"):
-        from estimators.moving_horizon import MovingHorizonEstimator
+        from estimators.algorithms.moving_horizon import MovingHorizonEstimator
 
         return MovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
     if settings.kind == "dmhe_relay":
-        from estimators.relay_mhe import RelayMovingHorizonEstimator
+        from estimators.algorithms.relay_mhe import RelayMovingHorizonEstimator
 
         return RelayMovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
     if settings.kind == "dekf_ci":
-        from estimators.dekf_ci import DistributedEkf
+        from estimators.algorithms.dekf_ci import DistributedEkf
 
         return DistributedEkf(settings, layout, slot, prior_mean, prior_covariance, period_s)
-    from estimators.centralized import CentralizedEkf
+    from estimators.algorithms.centralized import CentralizedEkf
 
     return CentralizedEkf(settings, layout, slot, prior_mean, prior_covariance, period_s)

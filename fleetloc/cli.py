@@ -1,6 +1,6 @@
 """The ``fleetloc`` command: collects the command groups and turns errors into one line and an exit code.
 
-A group of commands is a module ``fleetloc/commands_<name>.py`` with ``register(app)``. All of them are
+A group of commands is a module ``fleetloc/commands/<name>.py`` with ``register(app)``. All of them are
 imported at every start, so they import what is heavy (numba, scipy, matplotlib, zenoh, the rooms) inside the
 commands.
 """
@@ -18,7 +18,7 @@ from typing import Annotated
 
 import typer
 
-import fleetloc
+from fleetloc import commands
 from fleetloc.errors import BAD_INPUT, FAILED, INTERRUPTED, REFUSED
 
 ROOMS = ("estimators", "transport", "agent", "sim_bridge", "fleetloc")
@@ -59,9 +59,8 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback(invoke_without_command=True)(_root)
-    for module in pkgutil.iter_modules(fleetloc.__path__):
-        if module.name.startswith("commands_"):
-            importlib.import_module(f"fleetloc.{module.name}").register(app)
+    for module in pkgutil.iter_modules(commands.__path__):
+        importlib.import_module(f"{commands.__name__}.{module.name}").register(app)
     return app
 
 

@@ -17,7 +17,7 @@ from typing import Any, Literal
 
 import msgspec
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from estimators.settings import DEFAULT_KIND, DEFAULTS_OF_KIND, EstimatorSettings
 
 HEADER = """# Configuration reference

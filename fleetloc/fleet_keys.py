@@ -8,14 +8,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from agent.config_tables import FleetConfig
-from agent.security import key_folder, listening_hosts
+from agent.config.tables import FleetConfig
+from agent.radio.security import key_folder, listening_hosts
 from fleetloc.errors import InputError
-from transport.certificate_files import Member, authority_key_path, authority_path
-from transport.certificates import LEAF_DAYS, date, info_of, issue, make_authority, read_certificate
 from transport.errors import KeyFileError
-from transport.keys import add_key, init_keys, list_keys, public_path, retire_key, rotate_key, secret_path
-from transport.shared_keys import (
+from transport.security.certificate_files import Member, authority_key_path, authority_path
+from transport.security.certificates import LEAF_DAYS, date, info_of, issue, make_authority, read_certificate
+from transport.security.keys import add_key, init_keys, list_keys, public_path, retire_key, rotate_key, secret_path
+from transport.security.shared_keys import (
     group_path,
     key_fingerprint,
     load_group_keys,

@@ -6,12 +6,12 @@ from rich.console import Console
 from rich.markup import escape
 from rich.status import Status
 
-from estimators import compiled
-from estimators.kernel_cache import cache_folder
+from estimators.compiled import entries as compiled
+from estimators.compiled.cache import cache_folder
 
 
 class Announcer:
-    """Listener for `estimators.compiled`: a live line on a terminal, plain lines in a log.
+    """Listener for `estimators.compiled.entries`: a live line on a terminal, plain lines in a log.
 
     Silent as long as everything comes from the cache.
     """

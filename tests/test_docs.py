@@ -14,14 +14,14 @@ import pytest
 import typer
 import yaml
 
-from agent.config import FleetConfig, config_from, merged
-from agent.config_tables import SensorsTable
+from agent.config.reading import FleetConfig, config_from, merged
+from agent.config.tables import SensorsTable
 from agent.exit_codes import ExitCode
-from agent.health import Facts, State, assess
-from agent.uwb import UwbAdapter
+from agent.uwb.adapter import UwbAdapter
+from agent.watch.health import Facts, State, assess
 from estimators.estimator import Status
 from fleetloc.cli import build_app
-from sim_bridge.sitl_mission import load_mission
+from sim_bridge.sitl.mission import load_mission
 from transport.errors import Reason
 
 ROOT = Path(__file__).parents[1]

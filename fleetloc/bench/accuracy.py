@@ -13,8 +13,8 @@ from estimators.settings import EstimatorSettings
 from fleetloc.bench.plots import curves, save
 from fleetloc.bench.sweep import Point, fly, numbered, show, steady_from
 from fleetloc.output import print_table, progress_bar, with_error
-from sim_bridge.monte_carlo import Method, run_study, table1_row
-from sim_bridge.study_scenario import GRAPHS, Scenario, graph_of
+from sim_bridge.studies.monte_carlo import Method, run_study, table1_row
+from sim_bridge.studies.study_scenario import GRAPHS, Scenario, graph_of
 
 PAPER_TABLE1 = {
     "dekf_ci": (2.7651, 0.7059),

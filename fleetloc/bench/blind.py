@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from estimators.estimator import Status
 from fleetloc.bench.sweep import Point, fly
 from fleetloc.output import print_table
-from sim_bridge.monte_carlo import Method, Sample, mean_and_error
-from sim_bridge.study_scenario import GRAPHS, Scenario
+from sim_bridge.studies.monte_carlo import Method, Sample, mean_and_error
+from sim_bridge.studies.study_scenario import GRAPHS, Scenario
 
 SAMPLES = 100
 FIRST = 80

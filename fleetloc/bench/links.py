@@ -13,7 +13,7 @@ from fleetloc.bench.methods import FLAGSHIP, GENIE
 from fleetloc.bench.plots import curves, save
 from fleetloc.bench.sweep import STEADY_FROM, Flown, Point, fly, numbered, show
 from fleetloc.output import print_table, with_error
-from sim_bridge.link_conditions import (
+from sim_bridge.studies.link_conditions import (
     with_bursts,
     with_delay,
     with_duplicates,
@@ -21,9 +21,9 @@ from sim_bridge.link_conditions import (
     with_loss,
     with_one_way,
 )
-from sim_bridge.monte_carlo import Method
-from sim_bridge.recording import Recording
-from sim_bridge.study_scenario import Scenario
+from sim_bridge.studies.monte_carlo import Method
+from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_scenario import Scenario
 
 Rng = np.random.Generator
 

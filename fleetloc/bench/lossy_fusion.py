@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.lossy_fusion import (
+from estimators.algorithms.lossy_fusion import (
     AXES,
     STATES,
     CentralFilter,

@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 
 from estimators.settings import EstimatorSettings, default_settings
 from fleetloc.errors import InputError
-from sim_bridge.genie import Genie
-from sim_bridge.monte_carlo import Method
+from sim_bridge.studies.genie import Genie
+from sim_bridge.studies.monte_carlo import Method
 
 FLAGSHIP = "dmhe_relay"
 CENTRALISED = "centralized_iekf"

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from estimators.settings import EstimatorSettings
 from fleetloc.bench.plots import islands, save
 from fleetloc.output import print_table, progress_bar
-from sim_bridge.link_conditions import with_loss, with_partition
-from sim_bridge.lockstep import run_lockstep
-from sim_bridge.monte_carlo import LINK_STREAM, Hangar
-from sim_bridge.recording import Recording
-from sim_bridge.study_scenario import Scenario
+from sim_bridge.studies.link_conditions import with_loss, with_partition
+from sim_bridge.studies.lockstep import run_lockstep
+from sim_bridge.studies.monte_carlo import LINK_STREAM, Hangar
+from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_scenario import Scenario
 
 Floats = NDArray[np.float64]
 

@@ -13,7 +13,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fleetloc.report_plots import COLOURS, STYLE
+from fleetloc.report.report_plots import COLOURS, STYLE
 
 if TYPE_CHECKING:
     from fleetloc.bench.sweep import Flown

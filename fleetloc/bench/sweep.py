@@ -9,8 +9,8 @@ from typing import Any
 
 from fleetloc.bench.methods import CENTRALISED
 from fleetloc.output import print_table, progress_bar, with_error
-from sim_bridge.monte_carlo import Hangar, Link, Method, Sample, accuracy_row, ratio_of_means, run_study
-from sim_bridge.study_scenario import Scenario
+from sim_bridge.studies.monte_carlo import Hangar, Link, Method, Sample, accuracy_row, ratio_of_means, run_study
+from sim_bridge.studies.study_scenario import Scenario
 
 STEADY_FROM = 41
 """First sample that counts as steady (of 70)."""

@@ -8,10 +8,10 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from agent.health import GPS_LOST_S
+from agent.watch.health import GPS_LOST_S
 from estimators.estimator import Status
 from fleetloc.monitor.views import Drone, Level
-from transport.report_body import Diagnostics
+from transport.messages.report_body import Diagnostics
 
 Found = tuple[str, Level, str]
 GRAVE = ("not observable", "position unknown")

@@ -13,12 +13,12 @@ from pathlib import Path
 
 import msgspec
 
-from agent.config_tables import FleetConfig
-from agent.security import is_field, observer_credentials, observer_session
+from agent.config.tables import FleetConfig
+from agent.radio.security import is_field, observer_credentials, observer_session
 from transport.errors import Rejected
-from transport.opening import Opener, Received
-from transport.session import Handlers, Session, open_session
-from transport.streams import Stream
+from transport.link.session import Handlers, Session, open_session
+from transport.link.streams import Stream
+from transport.security.opening import Opener, Received
 
 STREAMS = (Stream.EST, Stream.DIAG)
 OnMessage = Callable[[Received], None]

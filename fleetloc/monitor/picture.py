@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agent.config_tables import FleetConfig
-from estimators.layout import Layout, block, position
+from agent.config.tables import FleetConfig
+from estimators.model.layout import Layout, block, position
 from fleetloc.monitor.alarms import DroneFacts, alarms_of_drone, alarms_of_fleet
 from fleetloc.monitor.links import LinkHistory, link_view, overdue_s
 from fleetloc.monitor.views import Alarm, Drone, Ellipse, Level, Link, Picture, SeenBy, Tracks, Triple
-from transport.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matrix
-from transport.report_body import Diagnostics
+from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matrix
+from transport.messages.report_body import Diagnostics
 
 SIGMAS = 3.0
 TRACK_SPACING_S = 0.2

@@ -12,15 +12,15 @@ import msgspec
 from rich.console import Console
 from rich.live import Live
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from fleetloc.monitor import table
 from fleetloc.monitor.listener import Listener
 from fleetloc.monitor.picture import FleetPicture
 from fleetloc.monitor.views import Picture
 from fleetloc.monitor.web import Board, WebServer
-from transport.estimate_body import FleetEstimate
-from transport.opening import Received
-from transport.report_body import Diagnostics
+from transport.messages.estimate_body import FleetEstimate
+from transport.messages.report_body import Diagnostics
+from transport.security.opening import Received
 
 LINE_PERIOD_S = 10.0
 TERMINAL_PERIOD_S = 0.5

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.recording import record_chunks
-from agent.tracking import ABSENT_VARIANCE
+from agent.fleet.tracking import ABSENT_VARIANCE
+from agent.log.estimate_log import record_chunks
 from estimators.estimator import Status
-from estimators.layout import STATES_PER_AGENT, Layout, block
+from estimators.model.layout import STATES_PER_AGENT, Layout, block
 from sim_bridge.replay.statistics import Floats, Spread, Thinned
 from sim_bridge.replay.tracks import Track
 
@@ -105,7 +105,7 @@ def compare(
     phases: Sequence[Phase],
     period_s: float,
 ) -> Compared:
-    """Put the record of one agent's estimates (`agent.recording`) against the tracks of all agents."""
+    """Put the record of one agent's estimates (`agent.log.estimate_log`) against the tracks of all agents."""
     result = Compared(agent_id, {phase.name: Errors() for phase in phases}, Thinned())
     for chunk in record_chunks(path, layout.size):
         result.ticks += len(chunk)

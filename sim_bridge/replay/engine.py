@@ -12,14 +12,14 @@ from collections import Counter
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
-from agent.samples import AttitudeSample, GpsSample, ImuSample
-from sim_bridge.lockstep_members import ObjectMember
+from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
 from sim_bridge.replay.feed import Arrival, Feed, Heard
 from sim_bridge.replay.range_files import RangeLine
-from sim_bridge.virtual_fleet import EventQueue, OnEstimate, VirtualFleet
-from transport.uwb_body import UwbFrame, UwbRange
+from sim_bridge.virtual.lockstep_members import ObjectMember
+from sim_bridge.virtual.virtual_fleet import EventQueue, OnEstimate, VirtualFleet
+from transport.messages.uwb_body import UwbFrame, UwbRange
 
 AHEAD_S = 0.5
 """How far the streams are read ahead: more than a message of truth may be late."""

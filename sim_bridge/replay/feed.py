@@ -16,8 +16,8 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Any, Protocol
 
-from agent.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
-from sim_bridge.logs.events import LogCounts, LogSample, LogSource, TruthSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
 from sim_bridge.replay.plan import Plan, Vehicle
 from sim_bridge.replay.range_files import RangeCounts, RangeLine
 from sim_bridge.replay.synthesis import Synthesiser

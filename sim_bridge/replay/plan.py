@@ -6,9 +6,9 @@ import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
-from agent.config_tables import FleetConfig
-from sim_bridge.logs.events import LogSource, LogSurvey, SystemSurvey
+from agent.config.tables import FleetConfig
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.logs.events import LogSource, LogSurvey, SystemSurvey
 from sim_bridge.replay.naming import names_apart
 
 LEAD_S = 10.0

@@ -30,7 +30,7 @@ from typing import Any
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.text_lines import text_lines
 from transport.errors import Rejected
-from transport.uwb_body import MAX_RANGE_M, UwbFrame, decode_uwb
+from transport.messages.uwb_body import MAX_RANGE_M, UwbFrame, decode_uwb
 
 NAMES: Mapping[str, tuple[str, ...]] = {
     "time": ("time", "time_s", "time_unix_s", "timestamp"),

@@ -16,11 +16,11 @@ from itertools import islice
 from multiprocessing.connection import Connection
 from typing import Any
 
-from agent.samples import AttitudeSample, ImuSample
+from agent.sensing.samples import AttitudeSample, ImuSample
 from sim_bridge import side_process
-from sim_bridge.logs.events import LogSource
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.feed import Arrival, Feed, Tallies
+from sim_bridge.replay.logs.events import LogSource
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.range_files import RangeLine
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Iterator
 from pathlib import Path
 
-from agent.flight_reader import FlightReader, RecordedInput
 from agent.inputs import HouseKept, UwbIn
+from agent.log.flight_reader import FlightReader, RecordedInput
 from sim_bridge.replay.range_files import RangeCounts, RangeLine, in_order, ranges_at
 from transport.errors import Rejected
-from transport.uwb_body import decode_uwb
+from transport.messages.uwb_body import decode_uwb
 
 
 def ranges_of_record(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:

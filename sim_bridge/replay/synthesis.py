@@ -12,9 +12,9 @@ from collections.abc import Iterator, Mapping
 import msgspec
 import numpy as np
 
-from agent.samples import Triple
-from sim_bridge.logs.events import TruthSample
+from agent.sensing.samples import Triple
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.logs.events import TruthSample
 from sim_bridge.replay.range_files import RangeLine
 
 MAX_GAP_S = 0.5

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.samples import Triple
+from agent.sensing.samples import Triple
 
 SUFFIX = ".track"
 ENTRY = np.dtype([("t_s", "<f8"), ("position_m", "<f8", 3), ("velocity_mps", "<f8", 3)])

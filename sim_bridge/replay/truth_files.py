@@ -17,11 +17,11 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from agent.frames import FleetFrame
-from agent.samples import Quaternion, Triple
-from sim_bridge.logs.events import TruthSample
-from sim_bridge.logs.stamps import rising
+from agent.sensing.frames import FleetFrame
+from agent.sensing.samples import Quaternion, Triple
 from sim_bridge.replay.errors import ReplayError
+from sim_bridge.replay.logs.events import TruthSample
+from sim_bridge.replay.logs.stamps import rising
 from sim_bridge.replay.text_lines import text_lines
 
 POSITION, VELOCITY, QUATERNION = ("n", "e", "d"), ("vn", "ve", "vd"), ("qw", "qx", "qy", "qz")

@@ -14,17 +14,17 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config import FleetConfig, config_from
+from agent.config.reading import FleetConfig, config_from
 from agent.core import AgentCore
-from agent.mavlink_codec import Decoder, Encoder, mavlink
+from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.outputs import EstimateReady, HealthChanged, Output, Send
-from agent.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
+from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
 from estimators.factory import make_estimator
 from tests.support.ports import HOST, free_ports
-from transport.auth import UNSIGNED
-from transport.opening import Opener
-from transport.sealing import Sealer
-from transport.streams import key_expression
+from transport.link.streams import key_expression
+from transport.security.auth import UNSIGNED
+from transport.security.opening import Opener
+from transport.security.sealing import Sealer
 
 GRAVITY_MPS2 = 9.80665
 CONFIG = """

@@ -9,13 +9,13 @@ import pytest
 
 from agent.core import AgentCore
 from agent.outputs import EstimateReady, Send
-from agent.samples import ImuSample, RangeSample
+from agent.sensing.samples import ImuSample, RangeSample
 from estimators.estimator import Status
 from estimators.factory import make_estimator
 from tests.support.notebook_estimator import MakeConfig, Notebook, fix, lone, received, tick_through
-from transport.information_body import Information
-from transport.measurement_body import Measurements, PositionRecord
-from transport.sealing import Sealer
+from transport.messages.information_body import Information
+from transport.messages.measurement_body import Measurements, PositionRecord
+from transport.security.sealing import Sealer
 
 Fleet = Any
 """The `VirtualFleet` of conftest.py."""

@@ -15,23 +15,23 @@ from typing import Any
 
 import pytest
 
-from agent.config import dump
+from agent.config.reading import dump
 from agent.daemon import Daemon
 from agent.exit_codes import ExitCode
-from agent.mavlink_codec import Encoder, mavlink
-from agent.observers import DaemonState, Observer
-from agent.recording import read_record
+from agent.log.estimate_log import read_record
+from agent.mavlink.codec import Encoder, mavlink
+from agent.watch.observers import DaemonState, Observer
 from estimators.estimator import Status
 from estimators.factory import make_estimator
 from tests.support.ports import HOST
-from transport.auth import UNSIGNED
-from transport.estimate_body import FleetEstimate
-from transport.keys import init_keys
-from transport.opening import Opener
-from transport.report_body import Diagnostics
-from transport.session import Handlers, open_session
-from transport.session_settings import SessionSettings
-from transport.streams import Stream
+from transport.link.session import Handlers, open_session
+from transport.link.session_settings import SessionSettings
+from transport.link.streams import Stream
+from transport.messages.estimate_body import FleetEstimate
+from transport.messages.report_body import Diagnostics
+from transport.security.auth import UNSIGNED
+from transport.security.keys import init_keys
+from transport.security.opening import Opener
 
 PATIENCE_S = 30.0
 
@@ -145,7 +145,7 @@ async def test_a_connection_on_which_the_autopilot_falls_silent_is_made_anew(
     config_of: Any, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Its end may have vanished without a word: a connection does not tell."""
-    monkeypatch.setattr("agent.mavlink_link.REOPEN_S", 0.02)
+    monkeypatch.setattr("agent.mavlink.link.REOPEN_S", 0.02)
     monkeypatch.setattr("agent.daemon.RENEW_PERIOD_S", 0.1)
     open_ends: list[asyncio.StreamWriter] = []
     # GIVEN an autopilot behind TCP that says one thing on the first two connections, and then nothing

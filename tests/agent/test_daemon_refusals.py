@@ -9,10 +9,10 @@ from typing import Any
 
 import pytest
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.daemon import run
 from agent.exit_codes import ExitCode
-from agent.logs import configure_logging
+from agent.watch.log_lines import configure_logging
 from estimators.factory import make_estimator
 from tests.support.ports import HOST, bound
 

@@ -11,13 +11,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.clock import FleetClock, require_epoch
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.errors import ConfigError, RecordError
-from agent.health import Facts, Health, HealthMonitor, State, assess
-from agent.onboard import OnboardAgent
-from agent.outputs import EstimateReady, estimate_message
-from agent.recording import (
+from agent.log.estimate_log import (
     EstimateRecorder,
     RecordHeader,
     covariance_of,
@@ -25,10 +21,14 @@ from agent.recording import (
     read_record,
     write_summary,
 )
+from agent.onboard import OnboardAgent
+from agent.outputs import EstimateReady, estimate_message
+from agent.sensing.clock import FleetClock, require_epoch
 from agent.warmup import warm_up
+from agent.watch.health import Facts, Health, HealthMonitor, State, assess
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from transport.auth import UNSIGNED
+from transport.security.auth import UNSIGNED
 
 MakeConfig = Callable[..., FleetConfig]
 

@@ -25,14 +25,14 @@ import numpy as np
 import zenoh
 from numpy.typing import NDArray
 
-from agent.config import load_config
-from agent.config_tables import FleetConfig
-from agent.endpoints import parse_endpoint
-from fleetloc import run_files
-from fleetloc.fleet_results import Results, load_results
-from fleetloc.lockstep_run import fly_in_lockstep
+from agent.config.endpoints import parse_endpoint
+from agent.config.reading import load_config
+from agent.config.tables import FleetConfig
 from fleetloc.output import print_table, write_json
-from fleetloc.processes import resident_mb
+from fleetloc.report.fleet_results import Results, load_results
+from fleetloc.run import run_files
+from fleetloc.run.lockstep_run import fly_in_lockstep
+from fleetloc.run.processes import resident_mb
 from tests.fleet.fuzz_traffic import (
     CAPTURED_FOR_S,
     HEARD,
@@ -48,11 +48,11 @@ from tests.fleet.fuzz_traffic import (
     PacketMaker,
 )
 from tests.support.fleet_process import FleetProcess, on_free_ports, until, with_overrides
-from transport.header import HEADER_BYTES, SIGNATURE_BYTES
-from transport.keys import init_keys
-from transport.report_body import Diagnostics, decode_diagnostics
-from transport.session_settings import SessionSettings, zenoh_config
-from transport.streams import Stream, key_expression, parse_key
+from transport.link.session_settings import SessionSettings, zenoh_config
+from transport.link.streams import Stream, key_expression, parse_key
+from transport.messages.header import HEADER_BYTES, SIGNATURE_BYTES
+from transport.messages.report_body import Diagnostics, decode_diagnostics
+from transport.security.keys import init_keys
 
 BURST_S = 0.005
 SETTLE_S, DRAIN_S = 2 * CAPTURED_FOR_S, 3.0

@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 import numpy as np
 from nacl.signing import SigningKey
 
-from agent.mavlink_codec import Decoder, Encoder, mavlink
-from transport.auth import UNSIGNED, Signing, sign
-from transport.header import HEADER, HEADER_BYTES, MAX_PACKET_BYTES, SIGNATURE_BYTES, fleet_hash
-from transport.streams import Stream, key_expression
-from transport.uwb_body import UwbFrame, UwbRange, encode_uwb_binary, encode_uwb_json
+from agent.mavlink.codec import Decoder, Encoder, mavlink
+from transport.link.streams import Stream, key_expression
+from transport.messages.header import HEADER, HEADER_BYTES, MAX_PACKET_BYTES, SIGNATURE_BYTES, fleet_hash
+from transport.messages.uwb_body import UwbFrame, UwbRange, encode_uwb_binary, encode_uwb_json
+from transport.security.auth import UNSIGNED, Signing, sign
 
 TARGET, NEIGHBOURS = 2, (1, 3)
 HEARD = (Stream.MEAS, Stream.INFO)

@@ -16,7 +16,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from agent.config import load_config
+from agent.config.reading import load_config
 from fleetloc.output import print_table, write_json
 from tests.support.lossnet.delivery import delivery
 from tests.support.lossnet.flight import LossyFlight, why_not

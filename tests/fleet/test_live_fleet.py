@@ -14,11 +14,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.config import load_config
-from agent.recording import read_record
-from fleetloc.fleet_report import report_figures
-from fleetloc.fleet_results import load_results
-from fleetloc.lockstep_run import fly_in_lockstep
+from agent.config.reading import load_config
+from agent.log.estimate_log import read_record
+from fleetloc.report.fleet_report import report_figures
+from fleetloc.report.fleet_results import load_results
+from fleetloc.run.lockstep_run import fly_in_lockstep
 from tests.support.fleet_process import ROOT, FleetProcess, until
 
 pytestmark = pytest.mark.slow

@@ -12,10 +12,10 @@ from typing import Any
 
 import pytest
 
-from agent.config import load_config
-from fleetloc.fleet_report import report_figures
-from fleetloc.fleet_results import load_results
-from fleetloc.lockstep_run import fly_in_lockstep
+from agent.config.reading import load_config
+from fleetloc.report.fleet_report import report_figures
+from fleetloc.report.fleet_results import load_results
+from fleetloc.run.lockstep_run import fly_in_lockstep
 from tests.support.lossnet.delivery import Delivery, delivery
 from tests.support.lossnet.flight import LossyFlight, why_not
 

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from agent.flight_format import CLOSED, CUT_OFF
-from agent.recording import covariance_of, read_record
+from agent.log.estimate_log import covariance_of, read_record
+from agent.log.flight_format import CLOSED, CUT_OFF
 from estimators.factory import make_estimator
-from sim_bridge.record_replay import ReplayedTick, replay_record
+from sim_bridge.replay.record_replay import ReplayedTick, replay_record
 from tests.support.fleet_process import FleetProcess, until
 
 pytestmark = pytest.mark.slow

@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config import load_config
+from agent.config.reading import load_config
 from fleetloc.cli import main
-from sim_bridge.sitl_mission import load_mission
-from sim_bridge.sitl_setup import vehicle_links
-from sim_bridge.truth import load_truth
+from sim_bridge.sitl.mission import load_mission
+from sim_bridge.sitl.setup import vehicle_links
+from sim_bridge.world.truth import load_truth
 from tests.support.fleet_process import PATIENCE_S, ROOT, processes_with
 from tests.support.loopback_sitl import FRAME, flavour_of
 from tests.support.ports import bound

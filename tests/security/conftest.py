@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import load_config
-from agent.config_tables import FleetConfig
+from agent.config.reading import load_config
+from agent.config.tables import FleetConfig
 from fleetloc import cli
 from tests.support.fleet_process import on_free_ports
 

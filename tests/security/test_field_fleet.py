@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.mavlink_signing import SIGNED
-from agent.recording import read_record
-from agent.tlog import read_frames
+from agent.log.estimate_log import read_record
+from agent.log.tlog import read_frames
+from agent.mavlink.signing import SIGNED
 from fleetloc import cli
 from tests.security.conftest import PROFILES
 from tests.support.fleet_process import FleetProcess, on_free_ports, with_overrides

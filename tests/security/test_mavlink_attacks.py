@@ -8,18 +8,18 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.autopilot import LinkState
-from agent.config import load_config
+from agent.config.reading import load_config
 from agent.errors import RecordError
 from agent.inputs import MavlinkIn
-from agent.mavlink_codec import Decoder, Encoder, Message, mavlink
-from agent.mavlink_signing import MAX_AHEAD_S, STAMP_EPOCH_UNIX_S, LinkSigning, Refusal
-from agent.mavlink_stamps import StampFile
+from agent.mavlink.codec import Decoder, Encoder, Message, mavlink
+from agent.mavlink.session import LinkState
+from agent.mavlink.signing import MAX_AHEAD_S, STAMP_EPOCH_UNIX_S, LinkSigning, Refusal
+from agent.mavlink.signing_stamps import StampFile
 from agent.onboard import OnboardAgent
 from estimators.factory import make_estimator
 from tests.security.conftest import PROFILES
-from transport.auth import UNSIGNED
 from transport.errors import KeyFileError
+from transport.security.auth import UNSIGNED
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 NOW_S = 1_800_000_000.0

@@ -12,11 +12,11 @@ from pathlib import Path
 
 import pytest
 
-from agent.config import load_config
+from agent.config.reading import load_config
 from agent.daemon import run
 from agent.errors import SecurityError
 from agent.exit_codes import ExitCode
-from agent.security import (
+from agent.radio.security import (
     agents_here,
     credentials,
     expiry_warnings,
@@ -32,9 +32,9 @@ from agent.security import (
 from estimators.factory import make_estimator
 from fleetloc import cli
 from tests.security.conftest import PROFILES, MakeFleet
-from transport.auth import UNSIGNED
 from transport.errors import KeyFileError
-from transport.shared_keys import load_mavlink_key
+from transport.security.auth import UNSIGNED
+from transport.security.shared_keys import load_mavlink_key
 
 DAY_S = 86_400.0
 

@@ -15,25 +15,25 @@ import pytest
 import zenoh
 from nacl.signing import SigningKey
 
-from agent.config_tables import FleetConfig
-from agent.radio import Radio
-from agent.security import agent_session, driver_session, host_start, observer_session
+from agent.config.tables import FleetConfig
+from agent.radio.radio import Radio
+from agent.radio.security import agent_session, driver_session, host_start, observer_session
 from tests.security.conftest import MakeFleet
 from tests.support.ports import bound
-from transport.certificate_files import Member, authority_path
-from transport.certificates import issue, make_authority
-from transport.clock_body import ClockAnswer, decode_clock_question
-from transport.envelope import Envelopes
-from transport.keys import load_secret
-from transport.measurement_body import Measurements, SpeedRecord
-from transport.opening import Opener
-from transport.sealing import Sealer
-from transport.session import Handlers, Session, open_session
-from transport.session_settings import SessionSettings, TlsSettings, zenoh_config
-from transport.shared_keys import load_group_keys
-from transport.streams import Stream, key_expression
-from transport.uwb_body import UwbFrame, UwbRange, encode_uwb_json
-from transport.uwb_seal import UwbSeal
+from transport.link.session import Handlers, Session, open_session
+from transport.link.session_settings import SessionSettings, TlsSettings, zenoh_config
+from transport.link.streams import Stream, key_expression
+from transport.messages.clock_body import ClockAnswer, decode_clock_question
+from transport.messages.measurement_body import Measurements, SpeedRecord
+from transport.messages.uwb_body import UwbFrame, UwbRange, encode_uwb_json
+from transport.security.certificate_files import Member, authority_path
+from transport.security.certificates import issue, make_authority
+from transport.security.envelope import Envelopes
+from transport.security.keys import load_secret
+from transport.security.opening import Opener
+from transport.security.sealing import Sealer
+from transport.security.shared_keys import load_group_keys
+from transport.security.uwb_seal import UwbSeal
 
 BOUND_S = 30.0
 BOOT = 2_000_000_000

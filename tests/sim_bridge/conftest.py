@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from agent.frames import FleetFrame
-from sim_bridge.scenario import Scenario, Vehicle
-from sim_bridge.simulation import Simulation
+from agent.sensing.frames import FleetFrame
+from sim_bridge.world.scenario import Scenario, Vehicle
+from sim_bridge.world.simulation import Simulation
 
 FRAME = FleetFrame(47.397742, 8.545594, 489.4, True, None)
 CLIENT_SYSTEM, CLIENT_COMPONENT = 245, 190

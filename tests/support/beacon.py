@@ -16,11 +16,11 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.config import load_config
-from agent.config_tables import FleetConfig
-from agent.radio import Radio
-from transport.estimate_body import FleetEstimate
-from transport.report_body import Diagnostics
+from agent.config.reading import load_config
+from agent.config.tables import FleetConfig
+from agent.radio.radio import Radio
+from transport.messages.estimate_body import FleetEstimate
+from transport.messages.report_body import Diagnostics
 
 ROOT = Path(__file__).parents[2]
 FIXES = 3.0

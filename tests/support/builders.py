@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.estimator import Estimate, Estimator
-from estimators.layout import Layout
-from estimators.measurements import (
+from estimators.model.layout import Layout
+from estimators.model.measurements import (
     InputTable,
     Kind,
     RowTable,
@@ -24,10 +24,10 @@ from estimators.measurements import (
     speed_row,
     velocity_rows,
 )
-from estimators.window import MeasurementWindow
-from estimators.window_types import WindowProblem
-from sim_bridge.recording import Recording
-from sim_bridge.study_scenario import Scenario
+from estimators.window.history import MeasurementWindow
+from estimators.window.types import WindowProblem
+from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_scenario import Scenario
 from tests.support import dense_reference as dense
 
 Array = NDArray[np.float64]

@@ -14,8 +14,8 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.measurements import Kind, RowTable
-from estimators.window_types import WindowProblem
+from estimators.model.measurements import Kind, RowTable
+from estimators.window.types import WindowProblem
 
 Array = NDArray[np.float64]
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.config_tables import SensorsTable
-from agent.frames import FleetFrame
-from agent.mavlink_codec import Encoder, Message, mavlink
-from sim_bridge.logs import open_log
-from sim_bridge.logs.events import LogError, LogEvent, LogSource
+from agent.config.tables import SensorsTable
+from agent.mavlink.codec import Encoder, Message, mavlink
+from agent.sensing.frames import FleetFrame
+from sim_bridge.replay.logs import open_log
+from sim_bridge.replay.logs.events import LogError, LogEvent, LogSource
 
 LOGS = Path(__file__).parents[1] / "data" / "logs"
 UNIX_S = 1_795_000_000.0

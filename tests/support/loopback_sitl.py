@@ -14,11 +14,11 @@ import traceback
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager, suppress
 
-from agent.endpoints import Endpoint, LinkKind, parse_endpoint
-from agent.frames import FleetFrame
-from sim_bridge.scenario import Scenario, Vehicle
-from sim_bridge.simulation import Simulation
-from sim_bridge.udp_autopilot import AutopilotPort, open_port
+from agent.config.endpoints import Endpoint, LinkKind, parse_endpoint
+from agent.sensing.frames import FleetFrame
+from sim_bridge.autopilot.udp_autopilot import AutopilotPort, open_port
+from sim_bridge.world.scenario import Scenario, Vehicle
+from sim_bridge.world.simulation import Simulation
 
 FRAME = FleetFrame(-35.363262, 149.165237, 584.0, True, None)
 STEP_S = 0.005

@@ -7,16 +7,16 @@ from typing import Any
 
 import numpy as np
 
-from agent.config_tables import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.core import AgentCore
-from agent.samples import GpsSample
+from agent.sensing.samples import GpsSample
 from estimators.estimator import Estimate, Payload, Status
-from estimators.layout import Layout
-from estimators.measurements import InputTable, Matrix, RowTable, Vector
+from estimators.model.layout import Layout
+from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.settings import EstimatorSettings
-from transport.header import Kind
-from transport.measurement_body import Measurements
-from transport.opening import Received
+from transport.messages.header import Kind
+from transport.messages.measurement_body import Measurements
+from transport.security.opening import Received
 
 MakeConfig = Callable[..., FleetConfig]
 

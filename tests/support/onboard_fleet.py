@@ -12,23 +12,23 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.config_tables import FleetConfig
-from agent.disk import DiskLimit
-from agent.flight_record import FlightRecord
-from agent.mcap_record import agent_key
+from agent.config.tables import FleetConfig
+from agent.log.disk import DiskLimit
+from agent.log.flight_record import FlightRecord
+from agent.log.mcap_record import agent_key
+from agent.log.run_record import flight_start
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady, Send
-from agent.run_record import flight_start
 from estimators.factory import make_estimator
-from sim_bridge.scenario import Scenario
-from sim_bridge.scenario_config import scenario_from_config
-from sim_bridge.simulation import Simulation
-from sim_bridge.uwb_frames import UwbDrivers
-from sim_bridge.virtual_fleet import EventQueue
-from transport.auth import UNSIGNED, Signing, Trust
-from transport.estimate_body import FleetEstimate
-from transport.sealing import Sealer
-from transport.streams import Stream, key_expression
+from sim_bridge.virtual.virtual_fleet import EventQueue
+from sim_bridge.world.scenario import Scenario
+from sim_bridge.world.scenario_config import scenario_from_config
+from sim_bridge.world.simulation import Simulation
+from sim_bridge.world.uwb_frames import UwbDrivers
+from transport.link.streams import Stream, key_expression
+from transport.messages.estimate_body import FleetEstimate
+from transport.security.auth import UNSIGNED, Signing, Trust
+from transport.security.sealing import Sealer
 
 HOST_START_S = 54_321.123456
 FLEET_START_S = 10_000.0

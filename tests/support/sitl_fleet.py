@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from agent.config import FleetConfig, config_from
+from agent.config.reading import FleetConfig, config_from
 from tests.support.loopback_sitl import FRAME
 
 

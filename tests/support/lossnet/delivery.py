@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.flight_reader import FlightReader, RecordedInput
 from agent.inputs import PacketIn
-from fleetloc import run_files
-from transport.header import Header, Kind, fleet_hash, unpack_header
-from transport.streams import Stream, parse_key
+from agent.log.flight_reader import FlightReader, RecordedInput
+from fleetloc.run import run_files
+from transport.link.streams import Stream, parse_key
+from transport.messages.header import Header, Kind, fleet_hash, unpack_header
 
 KIND_OF = {Stream.MEAS: Kind.MEAS, Stream.INFO: Kind.INFO}
 MCAP = ".mcap"

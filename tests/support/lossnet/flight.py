@@ -16,8 +16,8 @@ from contextlib import ExitStack
 from pathlib import Path
 from typing import IO, Any
 
-from agent.config import load_config
-from fleetloc import run_files
+from agent.config.reading import load_config
+from fleetloc.run import run_files
 from tests.support.lossnet.segment import address, ip
 
 ROOT = Path(__file__).parents[3]

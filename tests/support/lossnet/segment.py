@@ -20,7 +20,7 @@ import time
 
 import msgspec
 
-from transport.channel import Channel, ChannelSettings
+from transport.link.channel import Channel, ChannelSettings
 
 DEVICE = "radio0"
 MTU_BYTES = 1500

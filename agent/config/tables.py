@@ -1,0 +1,377 @@
+"""The tables of a fleet's configuration, one frozen struct each; `agent.config.reading` reads and checks them.
+
+Keys carry their unit. An absent optional key means what its docstring says.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable, MonitorTable
+from agent.config.security_table import SecurityTable as SecurityTable
+from agent.config.sitl_table import SitlTable
+from agent.radio.radio_faults import FaultsTable
+from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
+from estimators.settings import EstimatorSettings, default_settings
+
+AgentId = Annotated[int, msgspec.Meta(ge=1, le=999)]
+Positive = Annotated[float, msgspec.Meta(gt=0)]
+NotNegative = Annotated[float, msgspec.Meta(ge=0)]
+Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
+Seed = Annotated[int, msgspec.Meta(ge=0)]
+Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,32}$")]
+Point = tuple[float, float, float]
+"""NED metres in the fleet frame."""
+
+
+class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+    """A table of the configuration: frozen, unknown keys refused."""
+
+
+class OriginTable(Table, frozen=True):
+    """Geodetic origin of the fleet's NED frame."""
+
+    lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
+    lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
+    alt_m: Annotated[float, msgspec.Meta(ge=-500, le=20_000)]
+    altitude: Literal["ellipsoid", "msl"] = "msl"
+    """What ``alt_m`` and all heights of the fleet are above: the WGS84 ellipsoid or mean sea level."""
+
+
+class FleetTable(Table, frozen=True):
+    """``[fleet]``: what all agents agree on."""
+
+    name: Name
+    origin: OriginTable
+    period_s: Annotated[float, msgspec.Meta(ge=0.02, le=10)] = 0.1
+    """Length T of a tick."""
+    epoch_unix_s: NotNegative = 1_767_225_600.0
+    """Tick k is ``floor((t - epoch)/T)``, t the common (GNSS-disciplined) Unix time; absent = start of 2026.
+
+    Ticks are 32 bits wide on the wire, so that the epoch must be within 13 years at 10 Hz.
+    """
+    edges: tuple[tuple[AgentId, AgentId], ...] | None = None
+    """Who may hear and range whom, both ways; absent = neighbours are all who are heard."""
+    absent_after_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 10.0
+    """A drone of which nothing was heard or measured for longer is let go; it comes back when it is located again."""
+
+
+class AgentTable(Table, frozen=True):
+    """``[[agents]]``: one drone."""
+
+    id: AgentId
+    mavlink: str
+    """Address of the autopilot, e.g. ``udpin:127.0.0.1:14551`` or ``serial:/dev/ttyAMA0:921600``."""
+    name: str = ""
+    """For people only."""
+    autopilot: Literal["px4", "ardupilot", "auto"] = "auto"
+    system_id: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None
+    """MAVLink system id of the autopilot; absent = the agent's id (255 at most)."""
+    radio: str | None = None
+    """Address of this agent on the fleet's radio, IP or name; absent = its neighbours dial what it listens on."""
+    listen: tuple[str, ...] | None = None
+    """Zenoh endpoints of this agent besides those on the radio; absent = on loopback from ``transport.base_port``."""
+    connect: tuple[str, ...] | None = None
+    """Zenoh endpoints it dials; absent = those of the agents it hears that have a lower id."""
+
+
+class MavlinkTable(Table, frozen=True):
+    """``[mavlink]``: how the daemon behaves on the autopilot's link."""
+
+    component_id: Annotated[int, msgspec.Meta(ge=2, le=255)] = 197
+    imu_hz: Annotated[float, msgspec.Meta(ge=1, le=1000)] = 100.0
+    attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
+    local_position_hz: Annotated[float, msgspec.Meta(ge=0, le=50)] = 2.0
+    """For comparison only, never a measurement; 0 = not requested."""
+    timesync_respond: Literal["auto", "on", "off"] = "auto"
+    """auto = answer until another component of the link is seen answering."""
+    max_rtt_s: Positive = 0.010
+    """TIMESYNC exchanges slower than this (or twice the best) are not used."""
+    appear_timeout_s: NotNegative = 60.0
+    """The daemon gives up if no autopilot appears within this; 0 = it waits for ever. One that was there and
+    disappears never stops it."""
+    heartbeat_timeout_s: Positive = 3.0
+    end_after_lost_s: Positive | None = None
+    """An autopilot lost for this long ends the daemon, its records closed: for simulated flights; absent = never."""
+    rate_floor: Fraction = 0.6
+    """A stream below this share of its requested rate is requested again."""
+    signing: Literal["auto", "on", "off"] = "auto"
+    """Sign frames and refuse those that are not well signed: auto = in the field profiles on all links but serial
+    ones; off is refused there unless the link is serial or on loopback."""
+
+
+class SensorsTable(Table, frozen=True):
+    """``[sensors]``: the noise and delay that the daemon assumes.
+
+    A half width is the hard bound of a uniform noise; it sets the variance too (its square over 3).
+    """
+
+    gps_position_half_width_m: Positive | None = None
+    """Per axis; absent = the receiver's own accuracy (or the HDOP rule) and no hard bound."""
+    gps_speed: Literal["horizontal", "norm", "off"] = "horizontal"
+    """What GPS_RAW_INT.vel is: ground speed along cog (real receivers), or the velocity's norm (paper)."""
+    gps_speed_half_width_mps: Positive | None = None
+    gps_sigma_floor_m: Positive = 0.02
+    gps_speed_sigma_mps: Positive = 0.3
+    """Where the receiver does not report a speed accuracy."""
+    gps_uere_m: Positive = 2.5
+    """sigma = HDOP times this where the receiver reports no accuracy."""
+    gps_variance_factor: Annotated[float, msgspec.Meta(ge=1)] = 1.0
+    """On the receiver's own position variance. Its error wanders over a minute; a filter that takes ten fixes
+    a second for independent soon trusts their mean too much, unless each counts for less."""
+    gps_min_fix: Annotated[int, msgspec.Meta(ge=2, le=8)] = 3
+    geoid_separation_m: float | None = None
+    """Ellipsoid minus MSL height at the origin, for receivers that send only the other one."""
+    uwb_sigma_m: Positive = 0.1
+    """1-sigma of a range whose driver gives none."""
+    uwb_sigma_floor_m: Positive = 0.03
+    """Least 1-sigma, whatever the driver claims: what calibration leaves of a pair's bias does not average out."""
+    uwb_bound_m: Positive | None = None
+    """Hard bound of a range's noise; sets its variance (bound squared over 3) where present."""
+    uwb_max_range_m: Positive = 2000.0
+    uwb_max_age_s: Positive = 1.0
+    accel_sigma_mps2: Positive = 0.1
+    """1-sigma per axis of the acceleration averaged over a tick."""
+    accel_gap_sigma_mps2: Positive = 1.1547
+    """1-sigma of the acceleration while no IMU sample came (uniform in +-2 m/s2)."""
+    imu_max_gap_s: Positive = 0.05
+    """A longer silence between IMU samples counts as a gap."""
+    attitude_max_age_s: Positive = 0.3
+    """An IMU sample without an attitude this close is a gap too."""
+    gravity_mps2: Positive | None = None
+    """Absent = WGS84 normal gravity at the origin."""
+    imu_latency_s: float | None = None
+    """How much older the value is than its stamp says; absent = the autopilot's profile (docs/latency.md)."""
+    gps_latency_s: float | None = None
+    """The same of a fix; absent = the autopilot's profile, by the kind of stamp."""
+    gps_latency_sigma_s: NotNegative | None = None
+    """1-sigma of it; absent = the profile's, or 0 (exactly known, not estimated) where ``gps_latency_s`` is given."""
+    estimate_latency: bool = True
+    """Estimate the latency of GPS on line from manoeuvres, from there on; else it stays as assumed."""
+    uwb_latency_s: float = 0.0
+    """How much older a range is than its driver says, subtracted from its time."""
+
+
+class InitialTable(Table, frozen=True):
+    """``[initial]``: what an agent believes before anything is measured.
+
+    The prior of each agent is at ``position_m``, or, where that is absent, at its first fixes.
+    """
+
+    position_m: Point | None = None
+    """NED, for all agents; absent = wait for own fixes (or ranges and records of neighbours)."""
+    position_sigma_m: Positive = 50.0
+    """Of agents that nothing was heard of yet; own fixes narrow it by themselves."""
+    speed_sigma_mps: Positive = 3.0
+    """About the velocity that the first fixes show, or about zero."""
+    fixes: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
+    """Own GPS fixes before the estimator starts."""
+    max_wait_s: NotNegative = 2.0
+    """Without own fixes: start among the others, own place not observable yet, after this long."""
+
+
+class TransportTable(Table, frozen=True):
+    """``[transport]``: the radio between the agents."""
+
+    base_port: Annotated[int, msgspec.Meta(ge=1024, le=64_000)] = 17_447
+    """Agent number i (from 0, in order of the file) listens on loopback at this port + i."""
+    link: RadioLink = "tcp"
+    """What carries packets between agents: a stream, datagrams, or both (rounds on datagrams).
+    docs/links.md says which serves where; only ``tcp`` (TLS then) goes with ``security.profile = "field"``."""
+    radio_port: Annotated[int, msgspec.Meta(ge=1, le=65_535)] = 7447
+    """Where every agent listens at its address ``agents.radio``."""
+    lease_s: Annotated[float, msgspec.Meta(ge=0.1, le=600)] = 2.0
+    """Silence of a link after which neighbours consider this agent gone."""
+    open_timeout_s: Annotated[float, msgspec.Meta(ge=0.1, le=600)] = 1.5
+    """Longest time that a link may take to be opened before it is tried anew."""
+    retry_max_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 2.0
+    """Longest pause before a neighbour that does not answer is dialled again; from 0.2 s on they double."""
+    redeclare_after_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 1.0
+    """A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
+    guard_s: NotNegative = 0.01
+    """A tick is closed this long after its end, when its last samples have come in."""
+    exchange_fraction: Fraction = 0.3
+    """Share of the period, from the tick's end, after which measurement packets of a tick count as late."""
+    rounds_fraction: Fraction = 0.4
+    """Share of the period that all consensus rounds together may take."""
+    history_ticks: Annotated[int, msgspec.Meta(ge=1, le=20)] = 4
+    """Ticks of own records in each measurement packet, so that one packet repairs earlier losses."""
+    neighbour_timeout_s: Positive = 2.0
+    """A neighbour silent for longer is not waited for."""
+    information_format: Literal["auto", "float32", "float64"] = "auto"
+    """Precision of information pairs on the wire; auto = single where their conditioning allows."""
+    loss: Fraction = 0.0
+    """Injected after receive: probability that a packet is lost."""
+    delay_s: NotNegative = 0.0
+    """Injected after receive: constant delay."""
+    delay_jitter_s: NotNegative = 0.0
+    """Injected after receive: mean of an exponential delay on top."""
+    seed: Seed = 0
+    faults: FaultsTable = msgspec.field(default_factory=FaultsTable)
+    """What else is injected after receive."""
+
+
+class GpsOutage(Table, frozen=True):
+    """``[[sim.gps_outages]]``: one agent's receiver sees nothing for a while."""
+
+    agent: AgentId
+    from_s: NotNegative
+    to_s: Positive
+
+
+class WaypointsPath(Table, frozen=True, tag_field="kind", tag="waypoints"):
+    """Fly to the points in turn, each held for a while."""
+
+    agent: AgentId
+    points_m: Annotated[tuple[Point, ...], msgspec.Meta(min_length=1)]
+    hold_s: Positive = 10.0
+    """Time from one point to the next."""
+    repeat: bool = True
+
+
+class CirclePath(Table, frozen=True, tag_field="kind", tag="circle"):
+    """A horizontal circle, right-handed about down (clockwise from above)."""
+
+    agent: AgentId
+    center_m: Point
+    radius_m: Positive = 5.0
+    lap_s: Positive = 20.0
+    phase_rad: float = 0.0
+
+
+class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
+    """A horizontal Lissajous eight: north at the lap's frequency, east at twice that."""
+
+    agent: AgentId
+    center_m: Point
+    length_m: Positive = 10.0
+    """North-south extent."""
+    width_m: Positive = 5.0
+    """East-west extent."""
+    lap_s: Positive = 20.0
+    phase_rad: float = 0.0
+
+
+Path = WaypointsPath | CirclePath | FigureEightPath
+
+
+class SimTable(Table, frozen=True):
+    """``[sim]``: the simulated world; no agent reads it."""
+
+    seed: Seed = 1
+    profile: Literal["paper", "realistic"] = "paper"
+    """Noise: the paper's uniform one, or what real sensors look like."""
+    duration_s: Positive = 60.0
+    imu_hz: Annotated[float, msgspec.Meta(ge=10, le=1000)] = 100.0
+    attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
+    uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
+    max_accel_mps2: Positive = 2.0
+    """Commanded acceleration is clipped to this per axis."""
+    start_position_half_width_m: NotNegative = 15.0
+    """Starts are drawn uniformly from a cube about each path's start."""
+    start_speed_half_width_mps: NotNegative = 2.0
+    gps_outages: tuple[GpsOutage, ...] = ()
+    paths: tuple[Path, ...] = ()
+    """One per agent."""
+
+
+class RecordTable(Table, frozen=True):
+    """``[record]``: flight records on disk."""
+
+    directory: str | None = None
+    """Relative to the working folder; absent = record nothing."""
+    max_mb: Positive = 200.0
+    """Of an agent's estimates; the file stops growing here, the daemon goes on."""
+    flight: bool = True
+    """Whether to write a flight record beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
+    flight_max_mb: Positive = 2000.0
+    """Of a flight record, both files together; it ends here, the daemon goes on."""
+    min_free_mb: NotNegative = 100.0
+    """A flight record ends when its disk has less left."""
+
+
+class HealthTable(Table, frozen=True):
+    """``[health]``: how a daemon answers those who look after it (`fleetloc health`)."""
+
+    socket: str | None = None
+    """Path of a UNIX socket that tells the daemon's state to whoever connects; absent = none."""
+
+
+class FleetConfig(Table, frozen=True):
+    """The whole configuration of a fleet."""
+
+    fleet: FleetTable
+    agents: Annotated[tuple[AgentTable, ...], msgspec.Meta(min_length=1, max_length=999)]
+    estimator: EstimatorSettings = msgspec.field(default_factory=default_settings)
+    sensors: SensorsTable = msgspec.field(default_factory=SensorsTable)
+    initial: InitialTable = msgspec.field(default_factory=InitialTable)
+    mavlink: MavlinkTable = msgspec.field(default_factory=MavlinkTable)
+    transport: TransportTable = msgspec.field(default_factory=TransportTable)
+    security: SecurityTable = msgspec.field(default_factory=SecurityTable)
+    sim: SimTable = msgspec.field(default_factory=SimTable)
+    record: RecordTable = msgspec.field(default_factory=RecordTable)
+    health: HealthTable = msgspec.field(default_factory=HealthTable)
+    metrics: MetricsTable = msgspec.field(default_factory=MetricsTable)
+    log: LogTable = msgspec.field(default_factory=LogTable)
+    adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)
+    monitor: MonitorTable = msgspec.field(default_factory=MonitorTable)
+    sitl: SitlTable = msgspec.field(default_factory=SitlTable)
+
+    @property
+    def ids(self) -> tuple[int, ...]:
+        """Agent ids in the order of the file, which is the order of the state's blocks."""
+        return tuple(agent.id for agent in self.agents)
+
+    def agent(self, agent_id: int) -> AgentTable:
+        """The table of one agent; raises `KeyError` naming the id if it is not in the fleet."""
+        for table in self.agents:
+            if table.id == agent_id:
+                return table
+        raise KeyError(f"agent {agent_id} is not in the fleet {self.ids}")
+
+    def system_id(self, agent_id: int) -> int:
+        """MAVLink system id of an agent's autopilot."""
+        return self.agent(agent_id).system_id or agent_id
+
+    def neighbours(self, agent_id: int) -> tuple[int, ...]:
+        """Ids that an agent hears and ranges, in the order of the file."""
+        if self.fleet.edges is None:
+            return tuple(other for other in self.ids if other != agent_id)
+        joined = {a if b == agent_id else b for a, b in self.fleet.edges if agent_id in (a, b)}
+        return tuple(other for other in self.ids if other in joined)
+
+    def listen(self, agent_id: int) -> tuple[str, ...]:
+        """Zenoh endpoints an agent listens on."""
+        return tuple(dict.fromkeys((*self.device_endpoints(agent_id), *self._on_radio(agent_id))))
+
+    def device_endpoints(self, agent_id: int) -> tuple[str, ...]:
+        """Where a drone's own UWB driver, or an observer of the ground, dials its agent."""
+        own = self.agent(agent_id).listen
+        link = "tls" if self.security.profile == "field" else "tcp"
+        return (f"{link}/{LOOPBACK}:{self._base_port(agent_id)}",) if own is None else own
+
+    def connect(self, agent_id: int) -> tuple[str, ...]:
+        """Zenoh endpoints an agent dials: one side of each pair does, or both would build a link."""
+        own = self.agent(agent_id).connect
+        if own is not None:
+            return own
+        lower = (other for other in self.neighbours(agent_id) if other < agent_id)
+        return tuple(endpoint for other in lower for endpoint in self._on_radio(other))
+
+    def _on_radio(self, agent_id: int) -> tuple[str, ...]:
+        """What neighbours dial."""
+        link, host = self.transport.link, self.agent(agent_id).radio
+        if host is not None:
+            secure = self.security.profile == "field"
+            return radio_endpoints(link, host, self.transport.radio_port, secure=secure)
+        if link == "tcp":
+            return self.device_endpoints(agent_id)
+        port_above_the_devices = self._base_port(agent_id) + len(self.agents)
+        return radio_endpoints(link, LOOPBACK, port_above_the_devices)
+
+    def _base_port(self, agent_id: int) -> int:
+        return self.transport.base_port + self.ids.index(agent_id)

@@ -1,0 +1,89 @@
+"""Where a drone is by its fixes, before its block is part of the estimate."""
+
+from __future__ import annotations
+
+from collections import Counter, deque
+
+import numpy as np
+
+from agent.config.tables import FleetConfig
+from agent.fleet.motions import Motions
+from agent.sensing.samples import Triple
+from estimators.algorithms.membership import Prior
+from estimators.model.measurements import Matrix, Vector
+from transport.messages.measurement_body import PositionRecord, Record, VelocityRecord
+
+FRESH_TICKS = 30
+"""Fixes older than this say nothing about where a drone is now."""
+TRACK_FIXES = 20
+ENOUGH_FIXES = 10
+SPEED_SIGMA_MPS = 0.15
+"""A velocity surer than this needs no more fixes, up to `ENOUGH_FIXES`: a speed is linearised about its direction."""
+VELOCITY_SPREAD = 2.0
+"""On the variance of a velocity that is the slope of fixes: their errors are not quite independent."""
+
+
+class FixTracks:
+    """The last fixes of every drone, own and heard; ``motions`` is fed by its owner."""
+
+    def __init__(self, config: FleetConfig, motions: Motions) -> None:
+        self._settings = config.initial
+        self._period_s = config.fleet.period_s
+        self._motions = motions
+        self._fixes: dict[int, deque[PositionRecord]] = {}
+        self._count: Counter[int] = Counter()
+        self._velocities: dict[int, VelocityRecord] = {}
+
+    def note(self, record: Record) -> None:
+        """Take in a record."""
+        if isinstance(record, PositionRecord):
+            self._count[record.observer] += 1
+            self._fixes.setdefault(record.observer, deque(maxlen=TRACK_FIXES)).append(record)
+        elif isinstance(record, VelocityRecord):
+            known = self._velocities.get(record.observer)
+            if known is None or record.tick >= known.tick:
+                self._velocities[record.observer] = record
+
+    def place(self, agent_id: int, at_tick: int) -> Prior | None:
+        """The prior at a tick from the fixes before it; ``None`` if they do not suffice.
+
+        A wide prior about the place, which is left to the fixes to come to say. The velocity is what these fixes tell
+        of it by their slope, so that a speed or range is not linearised about a direction that nothing is known of.
+        """
+        fixes = [fix for fix in self._fixes.get(agent_id, ()) if at_tick - FRESH_TICKS <= fix.tick < at_tick]
+        if self._count[agent_id] < self._settings.fixes or len(fixes) < 2:
+            return None
+        moved, wandered = self._motions.before(agent_id, at_tick)
+        lead_s = np.array([(fix.tick - at_tick) * self._period_s + fix.offset_s for fix in fixes])
+        places = np.array([fix.position_m for fix in fixes]) - moved[[at_tick - fix.tick for fix in fixes]]
+        variance = np.array([fix.variance_m2 for fix in fixes])
+        variance += wandered[[at_tick - fix.tick for fix in fixes]][:, None]
+        position, velocity, speed_variance = self._line(lead_s, places, variance)
+        if self._count[agent_id] < ENOUGH_FIXES and speed_variance.max() > SPEED_SIGMA_MPS**2:
+            return None
+        mean, covariance = self.prior(position, velocity)
+        covariance[3:, 3:] = np.diag(speed_variance)
+        measured = self._velocities.get(agent_id)
+        if measured is not None and abs(at_tick - measured.tick) <= FRESH_TICKS:
+            known = np.asarray(measured.variance_m2ps2) < speed_variance
+            mean[3:][known] = np.asarray(measured.velocity_mps)[known]
+            covariance[3:, 3:][np.diag(known)] = self._settings.speed_sigma_mps**2  # measured again in the window
+        return mean, covariance
+
+    def prior(self, position_m: Vector | Triple, velocity_mps: Vector) -> Prior:
+        """A wide prior about a place, NED m and m/s: what is known is left to the measurements to say."""
+        sigma = [self._settings.position_sigma_m] * 3 + [self._settings.speed_sigma_mps] * 3
+        return np.concatenate((position_m, velocity_mps)), np.diag(np.square(sigma))
+
+    def _line(self, lead_s: Vector, places: Matrix, variance: Matrix) -> tuple[Vector, Vector, Vector]:
+        """Position and velocity ``(3,)`` at the reference of the lines that fit best, and the velocity's variance.
+
+        The velocity has the configured prior about zero.
+        """
+        weights = 1.0 / variance
+        total = weights.sum(axis=0)
+        middle_s, middle = (weights * lead_s[:, None]).sum(axis=0) / total, (weights * places).sum(axis=0) / total
+        apart = lead_s[:, None] - middle_s
+        information = (weights * apart**2).sum(axis=0) / VELOCITY_SPREAD + self._settings.speed_sigma_mps**-2.0
+        slope = (weights * apart * (places - middle)).sum(axis=0) / VELOCITY_SPREAD / information
+        return middle - middle_s * slope, slope, 1.0 / information

@@ -1,0 +1,106 @@
+"""Where a drone is that has no fixes: its ranges to drones whose places are known, over the last seconds.
+
+The places are the agent's own estimates of those drones at the ticks of the ranges, the drone's motion is integrated
+from its accelerations. The place that results is the prior of the drone's block; the ranges that the window still
+holds are not in it.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+
+import numpy as np
+
+from agent.config.tables import FleetConfig
+from agent.fleet.motions import MEMORY_TICKS, Motions
+from estimators.algorithms.membership import Prior
+from estimators.model.measurements import Matrix, Vector
+from estimators.model.multilateration import Place, RangeSet, multilaterate
+from transport.messages.measurement_body import RangeRecord, Record
+
+MAX_RANGES = 48
+"""More are thinned out: an attempt must fit into a tick."""
+MIN_RANGES = 4
+FRESH_TICKS = 5
+"""Without a range younger than this before the reference there is nothing to hold the drone there."""
+MAX_SIGMA_M = 1.5
+"""A place less sure than this along its worst direction is none."""
+CORRELATED = 4.0
+"""On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
+
+_Known = dict[int, tuple[Vector, Matrix]]
+"""Mean ``(6,)`` and position covariance ``(3, 3)`` by agent."""
+
+
+class RangeLocator:
+    """Keeps ranges and known places of the last `MEMORY_TICKS`; ``motions`` is fed by its owner."""
+
+    def __init__(self, config: FleetConfig, motions: Motions) -> None:
+        self._period_s = config.fleet.period_s
+        self._speed_sigma_mps = config.initial.speed_sigma_mps
+        self._ranges: deque[RangeRecord] = deque(maxlen=4096)
+        self._motions = motions
+        self._known: dict[int, _Known] = {}
+        self.ambiguous: set[int] = set()
+        """Drones whose ranges leave more than one place, as of the last attempt."""
+
+    def note(self, record: Record) -> None:
+        """Take in a record, own or heard."""
+        if isinstance(record, RangeRecord):
+            self._ranges.append(record)
+
+    def note_places(self, tick: int, known: _Known) -> None:
+        """Take in where the located drones are at a tick, and forget what is old."""
+        self._known[tick] = known
+        oldest = tick - MEMORY_TICKS
+        for old in [each for each in self._known if each < oldest]:
+            del self._known[old]
+        while self._ranges and self._ranges[0].tick < oldest:
+            self._ranges.popleft()
+
+    def place(self, agent_id: int, at_tick: int) -> Prior | None:
+        """The prior of a drone at a tick from its ranges before that tick; ``None`` if they leave it open."""
+        found = self._fit(agent_id, at_tick)
+        self.ambiguous.discard(agent_id)
+        if found is None or not found.fits:
+            return None
+        if len(found.rivals):
+            self.ambiguous.add(agent_id)
+        if len(found.rivals) or found.sigma_m > MAX_SIGMA_M:
+            return None
+        return found.mean, CORRELATED * found.covariance
+
+    def _fit(self, agent_id: int, at_tick: int) -> Place | None:
+        usable = [
+            (record, other, self._known[record.tick][other])
+            for record in self._ranges
+            if record.tick < at_tick
+            and (other := _other_end(record, agent_id)) is not None
+            and other in self._known.get(record.tick, {})
+        ]
+        usable.sort(key=lambda each: each[0].tick)
+        usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
+        if len(usable) < MIN_RANGES or at_tick - usable[-1][0].tick > FRESH_TICKS:
+            return None
+        moved, wandered = self._motions.before(agent_id, at_tick)
+        count = dict.fromkeys((other for _, other, _ in usable), 0)
+        for _, other, _ in usable:
+            count[other] += 1
+        anchors, leads, shifts, values, variances = [], [], [], [], []
+        for record, other, (mean, covariance) in usable:
+            back = at_tick - record.tick
+            anchors.append(mean[:3] + record.offset_s * mean[3:])
+            leads.append(record.offset_s - back * self._period_s)
+            shifts.append(moved[back])
+            values.append(record.range_m)
+            # an error that all ranges to a drone share does not average out over their number
+            shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
+            variances.append(record.variance_m2 + shared + wandered[back])
+        ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
+        return multilaterate(ranges, self._speed_sigma_mps)
+
+
+def _other_end(record: RangeRecord, agent_id: int) -> int | None:
+    if record.observer == agent_id:
+        return record.other
+    return record.observer if record.other == agent_id else None

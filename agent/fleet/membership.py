@@ -1,0 +1,223 @@
+"""Who is part of the estimate: drones join where they are located, and are let go when nothing speaks of them.
+
+The configuration lists who may come. A drone that is not located has no block, and what is measured of it waits: a
+range linearised about a wrong place would make a wrong place certain. Located is who has fixes of late, or ranges
+that leave one place only, or is well known to a neighbour. The agent's own block is always there; until it is
+located the estimate says so (`Status.NOT_OBSERVABLE`).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Collection, Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.config.tables import FleetConfig
+from agent.fleet.fix_tracks import FixTracks
+from agent.fleet.locating import RangeLocator
+from agent.fleet.motions import Motions
+from estimators.algorithms.membership import Prior, marginal_pair, silence_sigma_m
+from estimators.estimator import Estimate
+from estimators.model.layout import STATES_PER_AGENT, block, position
+from estimators.model.measurements import Vector
+from transport.messages.estimate_body import MAX_AGE_TICKS
+from transport.messages.information_body import Information
+from transport.messages.measurement_body import AccelerationRecord, RangeRecord, Record
+
+ATTEMPT_EVERY_TICKS = 3
+"""Places by ranges are sought this often: an attempt takes some milliseconds."""
+TOLD_SIGMA_M = 3.0
+"""A neighbour's pair locates a drone that it knows at least this well."""
+INFORMED_SHARE = 0.25
+"""A position this much surer than silence would have left it has been spoken of on the way."""
+HELD_SIGMA_M = 1.5
+"""A drone less well known is not held by ranges: they would be linearised where it is not."""
+RANGED_TICKS = 10
+"""A range older than this holds a drone no longer, nor does one to a drone that has been silent for longer."""
+DIRECTIONS = 3
+MIN_SPREAD = 0.03
+"""Of the directions of ranges: smallest share of their squares along an axis for it to count (about 10 degrees)."""
+
+
+def is_absent(age_ticks: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
+    """Which drones are no part of an estimate, by their ages in it."""
+    return np.asarray(age_ticks >= MAX_AGE_TICKS)
+
+
+def _pair(one: int, other: int) -> tuple[int, int]:
+    """Two agents, in either order."""
+    return (one, other) if one < other else (other, one)
+
+
+class Roll:
+    """The drones of the estimate and what is known of the others; ``members`` in the order of the configuration."""
+
+    def __init__(self, config: FleetConfig, agent_id: int) -> None:
+        self._config = config
+        self._agent_id = agent_id
+        self._period_s = config.fleet.period_s
+        self._motions = Motions(config)
+        self._tracks = FixTracks(config, self._motions)
+        self._locator = RangeLocator(config, self._motions)
+        self._heard: dict[int, int] = {}
+        self._ranged: dict[tuple[int, int], int] = {}
+        """Tick of the last range, by the ids of its ends."""
+        self._joined: dict[int, int] = {}
+        self._held: dict[int, int] = {}
+        """When the ranges to a drone that is silent itself last held it."""
+        self._told: dict[int, tuple[int, Prior]] = {}
+        self._sigma_m: dict[int, float] = {}
+        self._places: dict[int, Vector] = {}
+        self.members: tuple[int, ...] = ()
+        self.own_located = False
+
+    @property
+    def located(self) -> tuple[int, ...]:
+        """The members whose measurements can be used."""
+        return self.members if self.own_located else tuple(a for a in self.members if a != self._agent_id)
+
+    @property
+    def ambiguous(self) -> bool:
+        """Whether the own ranges leave more than one place."""
+        return not self.own_located and self._agent_id in self._locator.ambiguous
+
+    # --- what comes in -------------------------------------------------------------------------------------
+
+    def note(self, record: Record, tick: int) -> None:
+        """A record, own or heard."""
+        when = min(record.tick, tick)
+        if when > self._heard.get(record.observer, -math.inf):
+            self._heard[record.observer] = when
+        if isinstance(record, AccelerationRecord):
+            self._motions.note(record)
+        elif isinstance(record, RangeRecord):
+            self._locator.note(record)
+            pair = _pair(record.observer, record.other)
+            if when > self._ranged.get(pair, -math.inf):
+                self._ranged[pair] = when
+        else:
+            self._tracks.note(record)
+
+    def note_pair(self, message: Information) -> None:
+        """A neighbour's pair: what it knows well of drones that are not located here."""
+        for agent in message.agents:
+            if agent in self.located or (agent in self._heard and agent != self._agent_id):
+                continue
+            try:
+                information, vector = marginal_pair(
+                    (message.information, message.vector), [message.agents.index(agent)]
+                )
+                covariance = np.linalg.inv(information)
+            except np.linalg.LinAlgError:
+                continue  # the pair says nothing of this one
+            sigma_m = float(np.sqrt(max(covariance.diagonal()[:3].max(), 0.0)))
+            if sigma_m < TOLD_SIGMA_M:
+                self._told[agent] = message.state_tick, self._tracks.prior(*np.split(covariance @ vector, 2))
+
+    def note_estimate(self, estimate: Estimate) -> None:
+        """The latest estimate of the members."""
+        variances = estimate.covariance.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3]
+        sigmas_m = np.sqrt(variances.max(axis=1)).tolist()
+        self._sigma_m, known, located = dict(zip(self.members, sigmas_m, strict=True)), {}, self.located
+        for slot, agent in enumerate(self.members):
+            mean, at = estimate.mean[block(slot)], position(slot)
+            self._places[agent] = mean[:3]
+            if agent in located:
+                known[agent] = mean, estimate.covariance[at, at]
+        self._locator.note_places(estimate.tick, known)
+        for agent in self.members:
+            silent = estimate.tick - self._heard.get(agent, -math.inf) > RANGED_TICKS
+            near = self._sigma_m[agent] < HELD_SIGMA_M
+            if silent and near and self.anchors(agent, estimate.tick)[1] == DIRECTIONS:
+                self._held[agent] = max(t for pair, t in self._ranged.items() if agent in pair)
+
+    def usable(self, tick: int) -> tuple[int, ...]:
+        """The located members but those that fell silent and that ranges do not hold.
+
+        A few ranges to a drone that moves unseen confine it to a circle, which no Gaussian is like: they would make
+        it certain of a place on it.
+        """
+        limit = self._config.transport.neighbour_timeout_s / self._period_s
+        return tuple(agent for agent in self.located if self.silent_ticks(agent, tick) <= limit)
+
+    def silent_ticks(self, agent: int, tick: int) -> int:
+        """Ticks since a drone was heard or held; 0 for one that is known from neighbours' pairs alone."""
+        if agent == self._agent_id or agent not in self._heard:
+            return 0
+        return max(tick - max(self._heard[agent], self._held.get(agent, 0)), 0)
+
+    # --- who is in -----------------------------------------------------------------------------------------
+
+    def newcomers(self, tick: int, at_tick: int) -> dict[int, Prior]:
+        """Drones located since, with their priors at ``at_tick``: new ones, and those that had been lost sight of."""
+        found: dict[int, Prior] = {}
+        usable = self.usable(tick)
+        for agent in self._config.ids:
+            if agent not in usable:
+                prior = self._place(agent, tick, at_tick)
+                if prior is not None:
+                    found[agent] = prior
+        self._told = {}
+        return found
+
+    def gone(self, tick: int) -> tuple[int, ...]:
+        """Members of which nothing is known any more but what silence has left."""
+        return tuple(a for a in self.members if a != self._agent_id and self._is_gone(a, tick))
+
+    def enter(self, joined: Iterable[int], left: Collection[int], tick: int) -> None:
+        """Change the members; the own drone is one of them from the first on."""
+        joined = set(joined)
+        self.own_located |= self._agent_id in joined
+        wanted = (set(self.members) | joined | {self._agent_id}) - set(left)
+        self.members = tuple(agent for agent in self._config.ids if agent in wanted)
+        for agent in joined:
+            self._joined[agent] = self._held[agent] = tick
+
+    def return_to(self, members: tuple[int, ...], *, own_located: bool) -> None:
+        """Undo a change that was not estimated with: who joined then has to be located again."""
+        self.members, self.own_located = members, own_located
+
+    def anchors(self, agent: int, tick: int) -> tuple[int, int]:
+        """Located drones that a drone is ranged to, and how many directions of space (0..3) these ranges hold.
+
+        Only who is heard itself holds another.
+        """
+        near = [
+            self._places[other]
+            for other in self.located
+            if other != agent
+            and other in self._places
+            and tick - self._heard.get(other, -math.inf) <= RANGED_TICKS
+            and tick - self._ranged.get(_pair(agent, other), -math.inf) <= RANGED_TICKS
+        ]
+        if agent not in self._places or not near:
+            return 0, 0
+        away = np.array(near) - self._places[agent]
+        units = away / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None]
+        spread = np.linalg.eigvalsh(units.T @ units)
+        return len(near), int(np.count_nonzero(spread > MIN_SPREAD))
+
+    def _place(self, agent: int, tick: int, at_tick: int) -> Prior | None:
+        heard = tick - self._heard.get(agent, -math.inf) <= RANGED_TICKS
+        place = self._tracks.place(agent, at_tick) if heard else None
+        if place is None and tick % ATTEMPT_EVERY_TICKS == 0:
+            place = self._locator.place(agent, at_tick)
+        if place is None and agent in self._told:
+            told_tick, (mean, covariance) = self._told[agent]
+            moved = mean[:3] + (at_tick - told_tick) * self._period_s * mean[3:]
+            place = np.concatenate((moved, mean[3:])), covariance
+        return place
+
+    def _is_gone(self, agent: int, tick: int) -> bool:
+        since = max(self._heard.get(agent, 0), self._held.get(agent, 0), self._joined.get(agent, 0))
+        silent_s = (tick - since) * self._period_s
+        if silent_s <= self._config.fleet.absent_after_s:
+            return False
+        if agent in self._heard:
+            return True
+        # known from neighbours' pairs alone: as long as they keep it surer than silence would leave it
+        variance = self._config.estimator.other_accel_variance
+        return self._sigma_m.get(agent, 0.0) >= INFORMED_SHARE * silence_sigma_m(silent_s, variance, self._period_s)

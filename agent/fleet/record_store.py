@@ -1,0 +1,183 @@
+"""The measurement records an agent holds: which are used, which are sent on, and none twice."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Container, Iterable, Sequence
+
+from agent.config.tables import FleetConfig
+from agent.fleet.records import inputs_of, rows_of
+from estimators.model.measurements import InputTable, RowTable
+from transport.errors import EncodeError
+from transport.messages.measurement_body import (
+    AccelerationRecord,
+    Measurements,
+    RangeRecord,
+    Record,
+    as_sent,
+    identity,
+)
+
+KEEP_TICKS = 64
+"""Records older than this are forgotten; no window reaches that far."""
+AHEAD_TICKS = 2
+"""Records of a neighbour whose clock is ahead by more are refused."""
+
+
+class Neighbourhood:
+    """Who is how many hops away, and what that means for records.
+
+    With configured edges the hops are those of the graph. Without, neighbours are who is heard: one hop for a drone
+    that was heard directly of late, two for all others (a record does not say how far it came).
+    """
+
+    def __init__(self, config: FleetConfig, agent_id: int) -> None:
+        settings, size = config.estimator, len(config.ids)
+        self._rows_from, self._rows_to = 1 + settings.relay_hops, settings.relay_hops
+        """Hops from which rows are used, and from which they are sent on; the same of inputs."""
+        self._inputs_from = {"none": 0, "neighbours": 1, "fleet": size}[settings.share_inputs]
+        self._inputs_to = {"none": -1, "neighbours": 0, "fleet": size}[settings.share_inputs]
+        self._recent_ticks = math.ceil(config.transport.neighbour_timeout_s / config.fleet.period_s)
+        self._heard: dict[int, int] = {}
+        self._tick = 0
+        self._graph = {agent_id: 0}
+        """Hops along the configured edges to each agent that can be reached."""
+        self._by_reach = config.fleet.edges is None
+        self._agent_id = agent_id
+        frontier, distance = [agent_id], 0
+        while frontier:
+            distance += 1
+            reached = dict.fromkeys(n for one in frontier for n in config.neighbours(one))
+            frontier = [n for n in reached if n not in self._graph]
+            self._graph |= dict.fromkeys(frontier, distance)
+
+    def hear(self, agent_id: int, tick: int) -> None:
+        """A packet came directly from an agent."""
+        self._heard[agent_id] = tick
+        self._tick = max(self._tick, tick)
+
+    def hops(self, agent_id: int) -> int | None:
+        """Hops to an agent; ``None`` if no edges lead there."""
+        if not self._by_reach or agent_id == self._agent_id:
+            return self._graph.get(agent_id)
+        heard = self._heard.get(agent_id)
+        return 1 if heard is not None and self._tick - heard <= self._recent_ticks else 2
+
+    def uses(self, record: Record) -> bool:
+        """Whether this agent's estimator takes the record."""
+        hops = self.hops(record.observer)
+        limit = self._inputs_from if isinstance(record, AccelerationRecord) else self._rows_from
+        return hops is not None and hops <= limit
+
+    def sends(self, record: Record) -> bool:
+        """Whether this agent tells its neighbours: its own records, and others' that are relayed so far."""
+        hops = self.hops(record.observer)
+        limit = self._inputs_to if isinstance(record, AccelerationRecord) else self._rows_to
+        return hops is not None and hops <= limit
+
+
+class RecordStore:
+    """Records by tick, own and heard; ``refused`` counts those not taken, by reason."""
+
+    def __init__(self, config: FleetConfig, agent_id: int) -> None:
+        self._agent_id = agent_id
+        self._history_ticks = config.transport.history_ticks
+        self._hold_ticks = config.estimator.window
+        self.neighbourhood = Neighbourhood(config, agent_id)
+        self._seen: dict[int, dict[object, Record]] = {}
+        """The records taken in, by tick and identity."""
+        self._known: set[int] = set()
+        """``id`` of these objects: where packets are handed over as objects, most come again."""
+        self._to_send: dict[int, tuple[list[Record], list[Record]]] = {}
+        """Own and relayed records by tick."""
+        self._rows: list[Record] = []
+        self._inputs: list[AccelerationRecord] = []
+        self.refused: Counter[str] = Counter()
+
+    def add_own(self, record: Record) -> Record | None:
+        """Take in a record of our own sensors; it comes back as the wire rounds it, ``None`` if refused."""
+        try:
+            rounded = as_sent(record)
+        except EncodeError:
+            self.refused["own: out of range"] += 1
+            return None
+        return rounded if self._add(rounded) else None
+
+    def add_heard(self, records: Iterable[Record], tick: int) -> list[Record]:
+        """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
+        fresh = [record for record in records if id(record) not in self._known]
+        return [record for record in fresh if self._wanted(record, tick) and self._add(record)]
+
+    def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
+        """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
+
+        Slots are those of ``members``. Rows wait for the agents that they name to be ``located`` members, inputs for
+        theirs to be a member, as long as an estimator's window could still use them.
+        """
+        slots = {agent: slot for slot, agent in enumerate(members)}
+        usable = {agent for agent in members if agent in located}
+        rows: list[Record] = []
+        inputs: list[AccelerationRecord] = []
+        later: list[Record] = []
+        for record in self._rows:
+            end = record.other if isinstance(record, RangeRecord) else record.observer
+            ready = record.tick <= tick and record.observer in usable and end in usable
+            (rows if ready else later).append(record)
+        later_inputs: list[AccelerationRecord] = []
+        for push in self._inputs:
+            (inputs if push.tick < tick and push.observer in slots else later_inputs).append(push)
+        self._rows, self._inputs = later, later_inputs
+        self.forget(tick)
+        return rows_of(rows, slots), inputs_of(inputs, slots)
+
+    def forget(self, tick: int) -> None:
+        """Let go what no window that ends at a tick or later could use."""
+        first = tick - self._hold_ticks
+        waiting = [record for record in self._rows if record.tick >= first]
+        if len(waiting) < len(self._rows):
+            self.refused["not located"] += len(self._rows) - len(waiting)
+        self._rows = waiting
+        self._inputs = [record for record in self._inputs if record.tick >= first]
+        for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
+            self._known.difference_update(map(id, self._seen.pop(old).values()))
+            self._to_send.pop(old, None)
+
+    def packet(self, tick: int) -> Measurements:
+        """What neighbours get at a tick: the records of the last ticks, our own before relayed ones."""
+        records: list[Record] = []
+        for of_tick in range(tick, tick - self._history_ticks, -1):
+            for part in self._to_send.get(of_tick, ()):
+                records += part
+        return Measurements(tick, tuple(records))
+
+    def _wanted(self, record: Record, tick: int) -> bool:
+        """Whether a record that a neighbour sent is one to take in, if it is new."""
+        if record.observer == self._agent_id:
+            return False  # our own words, relayed back
+        if record.tick > tick + AHEAD_TICKS:
+            self.refused["heard: of the future"] += 1
+            return False
+        if record.tick < tick - KEEP_TICKS:
+            self.refused["heard: too old"] += 1
+            return False
+        if not self.neighbourhood.uses(record):
+            self.refused["heard: not used"] += 1
+            return False
+        return True
+
+    def _add(self, record: Record) -> bool:
+        """Take in a record; false if it is there already."""
+        seen, name = self._seen.setdefault(record.tick, {}), identity(record)
+        if name in seen:
+            return False
+        seen[name] = record
+        self._known.add(id(record))
+        if self.neighbourhood.sends(record):
+            own, relayed = self._to_send.setdefault(record.tick, ([], []))
+            (own if record.observer == self._agent_id else relayed).append(record)
+        if isinstance(record, AccelerationRecord):
+            self._inputs.append(record)
+        else:
+            self._rows.append(record)
+        return True

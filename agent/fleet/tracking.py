@@ -1,0 +1,281 @@
+"""The estimator of an agent through start, change of the fleet, and fault; it never stops, it only says less.
+
+The estimator works on the drones that are present (`agent.fleet.membership.Roll`). What leaves the house is in
+the layout of the whole configured fleet: an absent drone's block is at zero with a variance of 1e8 and the age
+"never" (`agent.fleet.membership.is_absent`).
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from agent.config.tables import FleetConfig
+from agent.fleet.membership import Roll
+from agent.fleet.record_store import RecordStore
+from estimators.algorithms.dekf_ci import DistributedEkf
+from estimators.algorithms.membership import (
+    Prior,
+    mapped_payload,
+    prior_tick,
+    states_of,
+    unseen_variance,
+    with_members,
+)
+from estimators.algorithms.moving_horizon import MovingHorizonEstimator
+from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
+from estimators.model.layout import STATES_PER_AGENT, Layout, block
+from estimators.model.measurements import InputTable, Matrix, Vector, empty_inputs, input_rows
+from estimators.settings import EstimatorSettings
+from transport.messages.estimate_body import MAX_AGE_TICKS
+from transport.messages.information_body import Information
+from transport.messages.measurement_body import Record
+
+EstimatorFactory = Callable[[EstimatorSettings, Layout, int, Vector, Matrix, float], Estimator]
+"""(settings, layout, own slot, prior mean, prior covariance, period in s) -> estimator."""
+
+ESTIMATOR_FAULTS = (ArithmeticError, ValueError)
+"""What broken numerics raise (numpy's LinAlgError is a ValueError): the estimator starts anew, nothing stops."""
+MAX_MEAN = 1e6
+RESTART_VARIANCE = 1.0
+"""What a start from the last good estimate adds to its covariance, in m2 and (m/s)2."""
+ABSENT_VARIANCE = 1e8
+"""Of a drone that is no part of the estimate, and of all before the start."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Good:
+    """An estimate to go on from, and who was in it."""
+
+    estimate: Estimate
+    members: tuple[int, ...]
+    own_located: bool
+
+
+class FleetTracker:
+    """Runs one agent's estimator tick by tick; raises `ESTIMATOR_FAULTS` from `begin`, `mix` and `solve`.
+
+    ``counters`` is where it counts starts, joins, leaves, refused pairs, and moves of the estimate.
+    """
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, counters: Counter[str]
+    ) -> None:
+        self._config = config
+        self._agent_id = agent_id
+        self._make_estimator = make_estimator
+        self._counters = counters
+        self._period_s = config.fleet.period_s
+        self._estimator: Estimator | None = None
+        self._good: _Good | None = None
+        self._since_s: float | None = None
+        self.roll = Roll(config, agent_id)
+        self.present: tuple[int, ...] = ()
+        """Whom the latest estimate speaks of, in the order of its blocks."""
+
+    @property
+    def started(self) -> bool:
+        """Whether there is an estimate, or was one to go on from."""
+        return self._estimator is not None or self._good is not None
+
+    def note(self, record: Record, tick: int) -> None:
+        """A record, own or heard, at the current tick."""
+        self.roll.note(record, tick)
+
+    # --- the tick ------------------------------------------------------------------------------------------
+
+    def begin(self, tick: int, now_s: float, records: RecordStore) -> bool:
+        """Let the fleet change and open the tick; false while nobody is located."""
+        if self._estimator is None:
+            if not self._start(tick, now_s):
+                records.forget(tick)
+                return False
+            rows, inputs = records.take(tick, self.roll.members, self.roll.usable(tick))
+            rows, inputs = rows[rows["tick"] == tick], inputs[:0]
+        else:
+            self._change(tick)
+            rows, inputs = records.take(tick, self.roll.members, self.roll.usable(tick))
+            unseen = self._unseen_manoeuvres(tick)
+            if len(unseen):
+                inputs = np.concatenate((inputs, unseen))
+        assert self._estimator is not None
+        self._estimator.begin(tick, rows, inputs)
+        return True
+
+    def outgoing(self, tick: int, round_: int) -> Information:
+        """What neighbours get in a round."""
+        assert self._estimator is not None
+        payload = self._estimator.outgoing(round_)
+        return Information(
+            tick, round_, payload.tick, payload.rank, self.roll.members, payload.information, payload.vector
+        )
+
+    def mix(self, round_: int, received: Mapping[int, Information]) -> None:
+        """One round with what neighbours sent, by sender."""
+        assert self._estimator is not None
+        own = self._estimator.outgoing(round_)
+        centre: Vector | None = None
+        pairs: dict[int, Payload] = {}
+        for sender, message in received.items():
+            if message.agents != self.roll.members:
+                self._counters["information: other members"] += 1
+                self.roll.note_pair(message)
+            if message.state_tick != own.tick:  # its window is shorter, as for a few ticks after its start
+                self._counters["information: other window"] += 1
+            elif sender not in self.roll.members:
+                self._counters["information: not located"] += 1
+            else:
+                pair = Payload(message.state_tick, message.information, message.vector, message.rank)
+                if message.agents != self.roll.members:
+                    if centre is None:
+                        centre = np.asarray(np.linalg.solve(own.information, own.vector), np.float64)
+                    pair = mapped_payload(pair, message.agents, self.roll.members, centre)
+                pairs[self.roll.members.index(sender)] = pair
+        self._estimator.mix(round_, pairs)
+
+    def solve(self) -> Estimate:
+        """The estimate of the tick, over the members."""
+        assert self._estimator is not None
+        estimate = self._estimator.solve()
+        if not _sound(estimate):
+            raise ArithmeticError("the estimate is not finite or its covariance not positive")
+        self._counters["estimate moved"] += estimate.report.moves
+        self._good = _Good(estimate, self.roll.members, self.roll.own_located)
+        self.present = self.roll.members
+        self.roll.note_estimate(estimate)
+        if not self.roll.own_located and estimate.status in (Status.OK, Status.NOT_CONVERGED, Status.NO_DATA):
+            estimate = replace(estimate, status=Status.NOT_OBSERVABLE)
+        return estimate
+
+    def nothing(self, tick: int) -> Estimate:
+        """The estimate of the own drone before the start: nothing known, and saying so."""
+        covariance = ABSENT_VARIANCE * np.eye(STATES_PER_AGENT)
+        age = np.array([MAX_AGE_TICKS])
+        self.present = (self._agent_id,)
+        return Estimate(tick, np.zeros(STATES_PER_AGENT), covariance, Status.NO_DATA, age, SolverReport())
+
+    def fall_back(self, tick: int) -> Estimate:
+        """After a fault: what follows from the last good estimate, flagged; the next tick starts from there."""
+        self._estimator = None
+        if self._good is None:
+            self.forget()
+            return self.nothing(tick)
+        good = self._good
+        self.present = good.members
+        self.roll.return_to(good.members, own_located=good.own_located)
+        mean, covariance = self._carried(good.estimate, tick)
+        return Estimate(tick, mean, covariance, Status.FELL_BACK, good.estimate.age_ticks, SolverReport())
+
+    def forget(self) -> None:
+        """Begin from nothing."""
+        self._estimator, self._good, self._since_s = None, None, None
+        self.roll = Roll(self._config, self._agent_id)
+
+    # --- start and change ----------------------------------------------------------------------------------
+
+    def _start(self, tick: int, now_s: float) -> bool:
+        """Make an estimator, of those who are located or were there before a fault."""
+        fresh = self._first_priors(tick, now_s) if self._good is None else self.roll.newcomers(tick, tick)
+        if self._good is None and not fresh:
+            return False
+        blocks: dict[int, Prior] = {}
+        if self._good is not None:  # after a fault: where they were going, less sure of it
+            mean, covariance = self._carried(self._good.estimate, tick)
+            for slot, agent in enumerate(self.roll.members):
+                blocks[agent] = mean[block(slot)], covariance[block(slot), block(slot)]
+        self.roll.enter(fresh, (), tick)
+        blocks |= fresh
+        layout = Layout(self.roll.members)
+        mean, covariance = np.zeros(layout.dimension), np.zeros((layout.dimension, layout.dimension))
+        for slot, agent in enumerate(layout.agents):
+            own = block(slot)
+            mean[own], covariance[own, own] = blocks[agent] if agent in blocks else self._unlocated(fresh)
+        self._estimator = self._make_estimator(
+            self._config.estimator, layout, layout.slot(self._agent_id), mean, covariance, self._period_s
+        )
+        self._counters["starts"] += 1
+        return True
+
+    def _first_priors(self, tick: int, now_s: float) -> dict[int, Prior]:
+        """Priors to begin with, empty while there is a reason to wait."""
+        initial = self._config.initial
+        if self._since_s is None:
+            self._since_s = now_s
+        if initial.position_m is not None:
+            sigma = [initial.position_sigma_m] * 3 + [initial.speed_sigma_mps] * 3
+            mean = np.array([*initial.position_m, 0.0, 0.0, 0.0])
+            return {agent: (mean, np.diag(np.square(sigma))) for agent in self._config.ids}
+        found = self.roll.newcomers(tick, tick)
+        waited = now_s - self._since_s >= initial.max_wait_s
+        return found if self._agent_id in found or waited else {}
+
+    def _unlocated(self, others: Mapping[int, Prior]) -> Prior:
+        """The own block while nothing says where it is: amid the others, as wide as can be."""
+        initial = self._config.initial
+        mean = np.mean([prior[0] for prior in others.values()], axis=0)
+        mean[3:] = 0.0
+        variance = [(2.0 * initial.position_sigma_m) ** 2] * 3 + [initial.speed_sigma_mps**2] * 3
+        return mean, np.diag(variance)
+
+    def _change(self, tick: int) -> None:
+        """Take in who has been located since the last tick, let go who is gone."""
+        estimator = self._estimator
+        if not isinstance(estimator, MovingHorizonEstimator | DistributedEkf):
+            return  # a yardstick of fixed fleets
+        fresh = self.roll.newcomers(tick, prior_tick(estimator))
+        gone = self.roll.gone(tick)
+        if not fresh and not gone:
+            return
+        self._counters["drones joined"] += len(fresh)
+        self._counters["drones gone"] += len(gone)
+        self.roll.enter(fresh, gone, tick)
+        if isinstance(estimator, DistributedEkf):
+            self._estimator = with_members(estimator, self.roll.members, self._agent_id, fresh)
+        else:
+            self._estimator = with_members(estimator, self.roll.members, self._agent_id, fresh)
+
+    def _unseen_manoeuvres(self, tick: int) -> InputTable:
+        """Accelerations, unknown, of drones silent for so long that none will come any more.
+
+        They go to every other tick, for two, lest the estimator learn from them how steady an acceleration is.
+        """
+        tables = []
+        settings = self._config.estimator
+        for slot, agent in enumerate(self.roll.members if tick % 2 == 0 else ()):
+            silent = self.roll.silent_ticks(agent, tick)
+            if silent > settings.window:
+                variance = unseen_variance(silent, settings.other_accel_variance, self._period_s)
+                tables.append(input_rows(tick - 1, slot, np.zeros(3), 2.0 * variance))
+        return np.concatenate(tables) if tables else empty_inputs()
+
+    def _carried(self, good: Estimate, tick: int) -> Prior:
+        """An earlier estimate of the members, moved on to this tick at its velocities, less sure of it."""
+        states = good.mean.reshape(-1, STATES_PER_AGENT).copy()
+        states[:, :3] += (tick - good.tick) * self._period_s * states[:, 3:]
+        return states.ravel(), good.covariance + RESTART_VARIANCE * np.eye(len(good.mean))
+
+
+def in_layout(estimate: Estimate, members: tuple[int, ...], layout: Layout) -> Estimate:
+    """An estimate of some drones in the layout of the whole fleet, the absent ones as the module's text says."""
+    told = np.minimum(estimate.age_ticks, MAX_AGE_TICKS - 1)
+    if members == layout.agents:
+        return replace(estimate, age_ticks=told)
+    at = states_of([layout.slot(agent) for agent in members])
+    mean = np.zeros(layout.dimension)
+    covariance = ABSENT_VARIANCE * np.eye(layout.dimension)
+    ages = np.full(layout.size, MAX_AGE_TICKS)
+    mean[at] = estimate.mean
+    covariance[np.ix_(at, at)] = estimate.covariance
+    ages[[layout.slot(agent) for agent in members]] = told
+    return replace(estimate, mean=mean, covariance=covariance, age_ticks=ages)
+
+
+def _sound(estimate: Estimate) -> bool:
+    """Whether an estimate is fit to leave the house, whatever its estimator promised."""
+    diagonal = estimate.covariance.diagonal()
+    return bool(
+        np.isfinite(estimate.covariance).all() and (np.abs(estimate.mean) <= MAX_MEAN).all() and (diagonal > 0).all()
+    )

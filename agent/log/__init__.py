@@ -1,0 +1,1 @@
+"""What a daemon keeps of its run: estimate log, flight log, telemetry log."""

@@ -1,0 +1,154 @@
+"""What an agent keeps of its run: every estimate, appended as it is made, readable after any end.
+
+A file is one line of JSON (what the run was) and then fixed-size binary entries. A process that is killed
+leaves at most one entry half written, which reading leaves out.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from agent.errors import RecordError
+from agent.outputs import EstimateReady
+from estimators.model.layout import Layout
+from estimators.model.measurements import Matrix
+
+FORMAT = "fleetloc-estimates/1"
+SUFFIX = ".estimates"
+FLUSH_EVERY = 10
+MAX_AGE_TICKS = 2**31 - 1
+CHUNK_NUMBERS = 1_000_000
+"""Size of the largest table that is held at a time where a record is read piece by piece, in numbers."""
+
+
+class RecordHeader(msgspec.Struct, frozen=True, kw_only=True):
+    """First line of a file."""
+
+    format: str = FORMAT
+    fleet: str
+    agent: int
+    agents: tuple[int, ...]
+    """Ids in the order of the blocks of the state."""
+    period_s: float
+    epoch_unix_s: float
+
+
+def entry_dtype(agents: int) -> np.dtype[Any]:
+    """One entry: the estimate of a tick, NED m and m/s, and when it was ready."""
+    dimension = Layout(tuple(range(1, agents + 1))).dimension
+    return np.dtype(
+        [
+            ("tick", "<i8"),
+            ("t_s", "<f8"),  # fleet time of the estimate
+            ("published_s", "<f8"),  # fleet time at which it was out
+            ("tick_time_s", "<f8"),  # what the tick took to compute
+            ("status", "i1"),
+            ("on_time", "?"),  # out within one period of the tick's end
+            ("age_ticks", "<i4", agents),
+            ("mean", "<f8", dimension),
+            ("covariance", "<f8", dimension * (dimension + 1) // 2),  # upper triangle by rows
+        ]
+    )
+
+
+class EstimateRecorder:
+    """Appends estimates to a file until it is full; then the agent goes on without."""
+
+    def __init__(self, path: Path, header: RecordHeader, max_bytes: int) -> None:
+        """Make the file anew; raises `RecordError` if that cannot be done."""
+        self.path = path
+        self.written = 0
+        """Entries written."""
+        self.skipped = 0
+        """Entries not written: the file is full or the disk fails."""
+        self._dtype = entry_dtype(len(header.agents))
+        self._triangle = np.triu_indices(Layout(header.agents).dimension)
+        self._period_s = header.period_s
+        self._left_bytes = max_bytes
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._file = path.open("wb")
+            self._file.write(msgspec.json.encode(header) + b"\n")
+        except OSError as error:
+            raise RecordError(f"record {path}: cannot be written: {error.strerror}") from error
+
+    def write(self, ready: EstimateReady, published_s: float, tick_time_s: float) -> None:
+        """Append one estimate."""
+        if self._left_bytes < self._dtype.itemsize:
+            self.skipped += 1
+            return
+        estimate = ready.estimate
+        entry = np.zeros((), self._dtype)
+        entry["tick"], entry["t_s"] = estimate.tick, ready.t_s
+        entry["published_s"], entry["tick_time_s"] = published_s, tick_time_s
+        entry["status"] = int(estimate.status)
+        entry["on_time"] = published_s <= ready.t_s + 2 * self._period_s
+        entry["age_ticks"] = np.minimum(estimate.age_ticks, MAX_AGE_TICKS)
+        entry["mean"] = estimate.mean
+        entry["covariance"] = estimate.covariance[self._triangle]
+        try:
+            self._file.write(entry.tobytes())
+            self._left_bytes -= self._dtype.itemsize
+            self.written += 1
+            if self.written % FLUSH_EVERY == 0:
+                self._file.flush()
+        except OSError:  # a full disk must not ground the fleet
+            self.skipped += 1
+
+    def close(self) -> None:
+        """Write out what is buffered."""
+        try:
+            self._file.close()
+        except OSError:
+            self.skipped += 1
+
+
+def read_record(path: Path) -> tuple[RecordHeader, NDArray[np.void]]:
+    """Header and entries of a file; raises `RecordError` naming the file and what is wrong."""
+    try:
+        raw = path.read_bytes()
+    except OSError as error:
+        raise RecordError(f"record {path}: cannot be read: {error.strerror}") from error
+    line, newline, content = raw.partition(b"\n")
+    try:
+        header = msgspec.json.decode(line, type=RecordHeader)
+    except msgspec.DecodeError as error:
+        raise RecordError(f"record {path}: expected a first line of {FORMAT}: {error}") from error
+    if header.format != FORMAT or not newline:
+        raise RecordError(f"record {path}: expected {FORMAT}, found {header.format!r}")
+    dtype = entry_dtype(len(header.agents))
+    whole = len(content) // dtype.itemsize
+    return header, np.frombuffer(content, dtype, whole)
+
+
+def record_chunks(path: Path, agents: int) -> Iterator[NDArray[np.void]]:
+    """The entries of a record, so many at a time that their covariances stay within `CHUNK_NUMBERS`."""
+    dtype = entry_dtype(agents)
+    count = max(CHUNK_NUMBERS // Layout(tuple(range(agents))).dimension ** 2, 16)
+    with path.open("rb") as file:
+        file.readline()
+        while len(chunk := np.fromfile(file, dtype, count)):
+            yield chunk
+
+
+def covariance_of(entry: NDArray[np.void] | np.void, agents: int) -> Matrix:
+    """The full covariance ``(6n, 6n)`` of one entry."""
+    dimension = 6 * agents
+    matrix = np.zeros((dimension, dimension))
+    matrix[np.triu_indices(dimension)] = entry["covariance"]
+    return np.asarray(matrix + np.triu(matrix, 1).T)
+
+
+def write_summary(path: Path, summary: dict[str, Any]) -> None:
+    """The counters of a finished run beside its record; raises `RecordError`."""
+    try:
+        path.write_text(json.dumps(summary, indent=1, sort_keys=True) + "\n", encoding="utf-8")
+    except OSError as error:
+        raise RecordError(f"summary {path}: cannot be written: {error.strerror}") from error

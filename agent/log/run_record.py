@@ -1,0 +1,88 @@
+"""What a daemon keeps of its run in its record's folder: estimates, flight record, and at the end its counters."""
+
+from __future__ import annotations
+
+import asyncio
+import platform
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+from agent.config.reading import dump
+from agent.config.tables import FleetConfig
+from agent.log.disk import DiskLimit
+from agent.log.estimate_log import SUFFIX, EstimateRecorder, RecordHeader, write_summary
+from agent.log.flight_format import FlightStart, trust_text
+from agent.log.flight_record import FlightRecord
+from agent.log.mcap_record import agent_key
+from agent.outputs import EstimateReady
+from agent.watch.observers import DaemonState, Observer
+from transport.security.auth import Trust
+
+MB = 1e6
+SOFTWARE = ("fleetloc", "numpy", "numba")
+"""What the last digits of an estimate depend on."""
+
+
+class RunRecord(Observer):
+    """The files ``agent_001.*`` of one run; ``flight`` is the journal of a flight record, if one is wanted."""
+
+    def __init__(
+        self, config: FleetConfig, agent_id: int, directory: Path, trust: Trust, *, unix_s: float, host_s: float
+    ) -> None:
+        """Make the files anew; raises `RecordError`. The times are those that the agent's clock began with."""
+        settings = config.record
+        self._epoch_unix_s = config.fleet.epoch_unix_s
+        stem = directory / agent_key(agent_id)
+        header = RecordHeader(
+            fleet=config.fleet.name,
+            agent=agent_id,
+            agents=config.ids,
+            period_s=config.fleet.period_s,
+            epoch_unix_s=config.fleet.epoch_unix_s,
+        )
+        self._estimates = EstimateRecorder(stem.with_suffix(SUFFIX), header, int(settings.max_mb * MB))
+        self.flight: FlightRecord | None = None
+        if settings.flight:
+            limit = DiskLimit(directory, int(settings.flight_max_mb * MB), int(settings.min_free_mb * MB))
+            self.flight = FlightRecord(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
+
+    def counters(self) -> dict[str, int]:
+        """What was not written, and how far the flight record is."""
+        flight = {} if self.flight is None else dict(self.flight.counters)
+        return {"record estimates skipped": self._estimates.skipped} | flight
+
+    def on_estimate(self, ready: EstimateReady, published_s: float, tick_time_s: float) -> None:
+        self._estimates.write(ready, published_s, tick_time_s)
+        if self.flight is not None:
+            self.flight.on_estimate(ready, published_s, published_s + self._epoch_unix_s)
+
+    def on_second(self, state: DaemonState) -> None:
+        if self.flight is not None:
+            self.flight.hand_over()
+
+    async def close(self, state: DaemonState) -> None:
+        """Write everything out, and the counters beside it; raises `RecordError` if those cannot be written."""
+        self._estimates.close()
+        if self.flight is not None:
+            await asyncio.to_thread(self.flight.close)
+        write_summary(self._estimates.path.with_suffix(".json"), state.as_dict())
+
+
+def flight_start(config: FleetConfig, agent_id: int, trust: Trust, unix_s: float, host_s: float) -> FlightStart:
+    """The begin of a flight record."""
+    versions = [f"{name} {_version(name)}" for name in SOFTWARE]
+    return FlightStart(
+        agent=agent_id,
+        config=dump(config),
+        trust=trust_text(trust),
+        unix_s=unix_s,
+        host_s=host_s,
+        software=", ".join([*versions, f"Python {platform.python_version()}", platform.machine()]),
+    )
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # run from the sources
+        return "unknown"

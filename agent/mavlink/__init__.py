@@ -1,0 +1,1 @@
+"""The autopilot's side: bytes, session, clocks, rates and signing."""

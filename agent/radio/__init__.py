@@ -1,0 +1,1 @@
+"""The neighbours' side: session, injected faults, links and credentials."""

@@ -1,0 +1,251 @@
+"""The daemon's side of the transport: seals packets, injects configured faults, watches presence.
+
+Packets are handed on as they came, decrypted where the fleet encrypts; `agent.onboard` opens them.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import time
+from collections import Counter
+from collections.abc import Callable
+from pathlib import Path
+
+from agent.config.tables import FleetConfig
+from agent.radio.radio_faults import channel_settings
+from agent.radio.security import agent_session, credentials, expiry_warnings, new_salt
+from transport.errors import EncodeError, Rejected, RejectionCounter
+from transport.link.channel import Channel, ChannelSettings
+from transport.link.session import Handlers, Session, open_session
+from transport.link.streams import Stream, key_expression, parse_key
+from transport.messages.clock_body import ClockAnswer, check_echo, decode_clock_question, encode_clock_question
+from transport.messages.information_body import Information
+from transport.security.sealing import Message, Packet, Sealer
+
+LOG = logging.getLogger("fleetloc.agent")
+USED_STREAMS = (Stream.MEAS, Stream.INFO)
+
+OnPacket = Callable[[str, bytes, float, int], None]
+"""(key expression, packet, arrival on the monotonic clock in s, UTC in ns that it is to be judged by)."""
+OnUwb = Callable[[bytes, float], None]
+"""(payload, arrival on the monotonic clock in s)."""
+OnGone = Callable[[int], None]
+
+
+class Radio:
+    """One agent's session with its neighbours; open it once, close it once.
+
+    ``trust`` holds the neighbours' public keys.
+    """
+
+    def __init__(
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        base: Path,
+        on_packet: OnPacket,
+        on_uwb: OnUwb,
+        on_gone: OnGone,
+    ) -> None:
+        """Read the keys and take the next start number; raises `SecurityError`, `KeyFileError`, `SettingsError`."""
+        self._config = config
+        self._agent_id = agent_id
+        self._fleet = config.fleet.name
+        self._neighbours = config.neighbours(agent_id)
+        self._on_packet, self._on_uwb, self._on_gone = on_packet, on_uwb, on_gone
+        own = credentials(config, agent_id, base, unix_s=time.time(), salt=new_salt())
+        for warning in expiry_warnings(config, agent_id, base, unix_s=time.time()):
+            LOG.warning("agent %d: %s", agent_id, warning)
+        self.trust, self._envelopes, self._uwb_seal = own.trust, own.envelopes, own.uwb_seal
+        self._settings = agent_session(config, agent_id, base)
+        self._sealer = Sealer(self._fleet, agent_id, boot=own.boot, signing=own.signing)
+        self._channel: Channel[tuple[str, bytes, float]] = Channel.seeded(
+            self._faults(None), seed=config.transport.seed, receiver=agent_id, neighbours=self._neighbours
+        )
+        self._flying = False
+        self._heard_s: dict[int, float] = {}
+        self._redeclared = 0
+        transport = config.transport
+        self._double = {"auto": None, "float32": False, "float64": True}[transport.information_format]
+        self._timer: asyncio.TimerHandle | None = None
+        self._repair: asyncio.TimerHandle | None = None
+        self._session: Session | None = None
+        self._unsent: Counter[str] = Counter()
+        self._rejections = RejectionCounter()
+        self._uwb_rejections = RejectionCounter()
+
+    async def open(self) -> None:
+        """Open the session, listen to the neighbours, then show that we are there; raises `SessionError`."""
+        handlers = Handlers(self._on_sample, self._on_presence, self._on_clock_question)
+        session = await open_session(self._settings, self._fleet, self._agent_id, self._config.ids, handlers)
+        self._heard_s = dict.fromkeys(self._neighbours, time.monotonic())
+        session.subscribe(self._agent_id, (Stream.UWB,))
+        for neighbour in self._neighbours:
+            session.subscribe(neighbour, USED_STREAMS)
+        session.announce()
+        self._session = session
+        self._repair_later()
+
+    async def close(self) -> None:
+        """Leave; neighbours see it at once."""
+        for timer in (self._timer, self._repair):
+            if timer is not None:
+                timer.cancel()
+        if self._session is not None:
+            await self._session.close()
+
+    def send(self, message: Message) -> None:
+        """Seal a message and put it out; one that cannot be sent is counted."""
+        if self._session is None:
+            return
+        try:
+            double = self._double if isinstance(message, Information) else None
+            packets = self._sealed(message, time.time_ns(), double)
+        except EncodeError as error:
+            kind = type(message).__name__
+            self._unsent[kind] += 1
+            level = logging.WARNING if self._unsent[kind] == 1 else logging.DEBUG
+            LOG.log(level, "agent %d: not sent: %s", self._agent_id, error)
+            return
+        for packet in packets:
+            self._session.publish(packet.stream, packet.data)
+
+    def _sealed(self, message: Message, t_ns: int, double: bool | None = None) -> list[Packet]:
+        packets = self._sealer.seal(message, t_ns=t_ns, double=double)
+        if self._envelopes is None:
+            return packets
+        keys = (key_expression(self._fleet, self._agent_id, packet.stream) for packet in packets)
+        return [
+            Packet(packet.stream, self._envelopes.close(key, packet.data))
+            for key, packet in zip(keys, packets, strict=True)
+        ]
+
+    def counters(self) -> dict[str, int]:
+        """What this side counts."""
+        session = self._session
+        counts = {
+            "packets sent": self._sealer.sent,
+            "packets unsent": self._unsent.total() + (session.failed if session else 0),
+            "packets shed": session.shed if session else 0,
+            "records left out": self._sealer.left_out,
+            "injected losses": sum(self._channel.lost.values()),
+            "subscriptions repeated": self._redeclared,
+        }
+        counts |= {f"rejected {reason}": count for reason, count in self._rejections.as_dict().items()}
+        return counts | {f"rejected uwb {reason}": count for reason, count in self._uwb_rejections.as_dict().items()}
+
+    async def ask_clocks(self) -> None:
+        """Measure the offset of each neighbour's clock once."""
+        if self._session is not None:
+            await asyncio.gather(*(self._ask_clock(self._session, other) for other in self._neighbours))
+
+    async def _ask_clock(self, session: Session, agent_id: int) -> None:
+        asked_ns = time.time_ns()
+        answer = await session.ask_clock(agent_id, encode_clock_question(asked_ns))
+        if answer is None:
+            return
+        packet, arrived_ns = answer
+        key = key_expression(self._fleet, agent_id, Stream.CLOCK)
+        self._hand_on(key, packet, time.monotonic(), arrived_ns, asked_ns)
+
+    def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
+        try:
+            asked_ns = decode_clock_question(question)
+        except Rejected:
+            self._unsent["clock question malformed"] += 1
+            return None
+        now_ns = time.time_ns()
+        # Our UTC clock may be set back while we answer; an answer may not come before its question.
+        answer = ClockAnswer(asked_ns, arrived_ns, max(now_ns, arrived_ns))
+        return self._sealed(answer, now_ns)[0].data
+
+    def _on_sample(self, key: str, payload: bytes, arrived_s: float) -> None:
+        parsed = parse_key(key)
+        if parsed is None:
+            return  # not one of the keys that were subscribed to
+        _, sender, stream = parsed
+        if stream is Stream.UWB:
+            self._take_uwb(key, payload, arrived_s)
+            return
+        self._heard_s[sender] = arrived_s
+        self._channel.offer(sender, (key, payload, arrived_s), arrived_s)
+        self._deliver()
+
+    def _take_uwb(self, key: str, payload: bytes, arrived_s: float) -> None:
+        """Hand on a frame; where links are open to strangers, only one that our own driver sealed."""
+        if self._uwb_seal is not None:
+            try:
+                payload = self._uwb_seal.open(key, payload)
+            except Rejected as rejected:
+                first = not self._uwb_rejections[rejected.reason]
+                self._uwb_rejections.count(rejected.reason)
+                LOG.log(logging.WARNING if first else logging.DEBUG, "agent %d: %s", self._agent_id, rejected)
+                return
+        self._on_uwb(payload, arrived_s)
+
+    def begin_flight(self, host_s: float) -> None:
+        """The autopilot was heard: from the first such instant on count the times of injected outages."""
+        if not self._flying:
+            self._channel.change(self._faults(host_s))
+        self._flying = True
+
+    def _faults(self, began_s: float | None) -> ChannelSettings:
+        transport = self._config.transport
+        return channel_settings(
+            transport.faults,
+            self._agent_id,
+            loss=transport.loss,
+            delay_s=transport.delay_s,
+            delay_jitter_s=transport.delay_jitter_s,
+            began_s=began_s,
+        )
+
+    def _repair_later(self) -> None:
+        after_s = self._config.transport.redeclare_after_s
+        self._repair = asyncio.get_running_loop().call_later(after_s, self._redeclare)
+
+    def _redeclare(self) -> None:
+        """Tell silent neighbours again what we listen to.
+
+        Zenoh tells a neighbour once per link, and a datagram that is lost is not repeated: it would send us nothing
+        as long as the link lives.
+        """
+        latest_s = time.monotonic() - self._config.transport.redeclare_after_s
+        for neighbour, heard_s in self._heard_s.items():
+            if self._session is not None and heard_s < latest_s:
+                self._session.resubscribe(neighbour)
+                self._redeclared += 1
+        self._repair_later()
+
+    def _deliver(self) -> None:
+        """Hand on what the channel lets through by now, and come back for what it delays."""
+        now_s = time.monotonic()
+        for _, (key, payload, arrived_s) in self._channel.due(now_s):
+            self._hand_on(key, payload, arrived_s, time.time_ns())
+        if self._timer is not None:
+            self._timer.cancel()
+            self._timer = None
+        due_s = self._channel.next_due()
+        if due_s is not None:
+            self._timer = asyncio.get_running_loop().call_at(due_s, self._deliver)
+
+    def _hand_on(
+        self, key: str, payload: bytes, arrived_s: float, unix_ns: int, asked_ns: int | None = None
+    ) -> None:
+        """Hand on a packet as it was sealed; with ``asked_ns`` only if it answers the question asked then."""
+        try:
+            if self._envelopes is not None:
+                payload = self._envelopes.open(key, payload)
+            if asked_ns is not None:
+                check_echo(payload, asked_ns)
+        except Rejected as rejected:
+            self._rejections.count(rejected.reason)
+            LOG.debug("agent %d: %s", self._agent_id, rejected)
+            return
+        self._on_packet(key, payload, arrived_s, unix_ns)
+
+    def _on_presence(self, agent_id: int, alive: bool) -> None:
+        if agent_id in self._neighbours and not alive:
+            LOG.info("agent %d: neighbour %d has left", self._agent_id, agent_id)
+            self._on_gone(agent_id)

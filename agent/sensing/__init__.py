@@ -1,0 +1,1 @@
+"""What sensors say, when, and in which frame."""

@@ -1,0 +1,1 @@
+"""The UWB module's side."""

@@ -1,0 +1,72 @@
+"""UWB ranges as ``uwb-range/1`` frames to range samples; what a serial driver makes goes the same way."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection
+
+from agent.config.tables import SensorsTable
+from agent.sensing.samples import RangeSample
+from transport.messages.uwb_body import UwbFrame, UwbIntake, UwbRange
+
+NLOS_REJECT_DB = 10.0
+NLOS_SUSPECT_DB = 6.0
+NLOS_SUSPECT_PROBABILITY = 0.5
+NLOS_SIGMA_FACTOR = 3.0
+MAX_LEAD_S = 0.05
+
+
+class UwbAdapter:
+    """The ranges that one observer's module sees.
+
+    A first path much weaker than the whole signal means no line of sight: such a range is far too long. It is
+    refused above 10 dB and trusted a third as much above 6 dB (the rule of thumb for DW1000 radios).
+    """
+
+    def __init__(self, observer: int, others: Collection[int], sensors: SensorsTable) -> None:
+        self._observer = observer
+        self._others = frozenset(others)
+        self._sensors = sensors
+        self.intake = UwbIntake(observer, max_age_s=sensors.uwb_max_age_s)
+        self.skipped: Counter[str] = Counter()
+        """Ranges left out, by reason; `intake` counts refused frames."""
+
+    def receive(self, payload: bytes, *, now_s: float, host_s: float, unix_s: float) -> list[RangeSample]:
+        """The samples in a frame.
+
+        ``now_s`` is the fleet time of its arrival, ``host_s`` and ``unix_s`` the same instant on this host's
+        monotonic and UTC clocks, one of which the driver stamped with.
+        """
+        accepted = self.intake.accept(payload, unix_s=unix_s, monotonic_s=host_s)
+        if accepted is None:
+            return []
+        return self.samples_of(*accepted, now_s)
+
+    def samples_of(self, frame: UwbFrame, age_s: float, now_s: float) -> list[RangeSample]:
+        """The samples in a frame that was accepted ``age_s`` after its measurement, at fleet time ``now_s``."""
+        measured_s = now_s - max(age_s, 0.0) - self._sensors.uwb_latency_s
+        samples = (self._sample(entry, measured_s, now_s) for entry in frame.ranges)
+        return [sample for sample in samples if sample is not None]
+
+    def _sample(self, entry: UwbRange, measured_s: float, now_s: float) -> RangeSample | None:
+        sigma_m = self._sensors.uwb_sigma_m if entry.sigma_m is None else entry.sigma_m
+        t_s = measured_s + entry.offset_s
+        if entry.other not in self._others:
+            return self._skip("not a neighbour")
+        if entry.range_m > self._sensors.uwb_max_range_m:
+            return self._skip("too far")
+        if t_s > now_s + MAX_LEAD_S:
+            return self._skip("wrong time")
+        weakness_db = 0.0
+        if entry.rx_dbm is not None and entry.first_path_dbm is not None:
+            weakness_db = entry.rx_dbm - entry.first_path_dbm
+        if weakness_db > NLOS_REJECT_DB:
+            return self._skip("no line of sight")
+        if weakness_db > NLOS_SUSPECT_DB or (entry.nlos or 0.0) > NLOS_SUSPECT_PROBABILITY:
+            sigma_m *= NLOS_SIGMA_FACTOR
+        sigma_m = max(sigma_m, self._sensors.uwb_sigma_floor_m)
+        return RangeSample(t_s, self._observer, entry.other, entry.range_m, sigma_m)
+
+    def _skip(self, reason: str) -> RangeSample | None:
+        self.skipped[reason] += 1
+        return None

@@ -1,0 +1,1 @@
+"""What a daemon tells those who look after it."""

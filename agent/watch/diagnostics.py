@@ -1,0 +1,159 @@
+"""What a daemon says of itself once a second: counters and gauges by name, units in the names."""
+
+from __future__ import annotations
+
+import math
+import os
+import resource
+import time
+from collections import deque
+from collections.abc import Iterable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from agent.core import AgentCore
+from agent.mavlink.link import MavlinkLink
+from agent.mavlink.session import AutopilotSession
+from agent.uwb.adapter import UwbAdapter
+from transport.messages.header import MAX_BODY_BYTES, Kind
+from transport.messages.report_body import Diagnostics
+from transport.security.opening import Opener
+
+TICKS_REMEMBERED = 1024
+TICKS_REMEMBERED = 1024
+MAX_NAME, MAX_REASON, MAX_NEIGHBOURS = 64, 128, 256
+"""Characters of a name, of a reason, and neighbours: more a packet of diagnostics does not hold."""
+
+
+class TickTimes:
+    """How long the last ticks took to compute and how late after their end they were out, in s."""
+
+    def __init__(self) -> None:
+        self._compute_s: deque[float] = deque(maxlen=TICKS_REMEMBERED)
+        self._latency_s: deque[float] = deque(maxlen=TICKS_REMEMBERED)
+
+    def add(self, compute_s: float, latency_s: float) -> None:
+        """Note one tick."""
+        self._compute_s.append(compute_s)
+        self._latency_s.append(latency_s)
+
+    def gauges(self) -> dict[str, float]:
+        """Median and 99th percentile of both, nothing before the first tick."""
+        gauges: dict[str, float] = {}
+        for name, values in (("tick_time", self._compute_s), ("publish_latency", self._latency_s)):
+            if values:
+                median, tail = np.percentile(list(values), [50, 99])
+                gauges |= {f"{name}_p50_s": float(median), f"{name}_p99_s": float(tail)}
+        return gauges
+
+
+class ProcessUse:
+    """Share of one core used since the start of the process's measurement, and resident memory."""
+
+    def __init__(self) -> None:
+        self._wall_s = time.monotonic()
+        self._cpu_s = _cpu_s()
+
+    def gauges(self) -> dict[str, float]:
+        """``cpu_fraction`` and ``rss_mb``."""
+        wall_s = max(time.monotonic() - self._wall_s, 1e-3)
+        return {"cpu_fraction": (_cpu_s() - self._cpu_s) / wall_s, "rss_mb": _rss_mb()}
+
+
+def _cpu_s() -> float:
+    use = resource.getrusage(resource.RUSAGE_SELF)
+    return use.ru_utime + use.ru_stime
+
+
+def _rss_mb() -> float:
+    statm = Path("/proc/self/statm")
+    if statm.exists():
+        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
+
+
+def counters_of(
+    core: AgentCore, session: AutopilotSession, link: MavlinkLink, uwb: UwbAdapter, opener: Opener
+) -> dict[str, int]:
+    """Everything that is counted, by name; names of the same thing share their first word."""
+    decoder = session.decoder
+    counters = {
+        "mavlink rx": decoder.received,
+        "mavlink tx": session.sent,
+        "mavlink lost": decoder.lost,
+        "mavlink bad": decoder.bad.total(),
+        "mavlink tx dropped": link.dropped,
+        "mavlink opened": link.opened,
+        "mavlink reboots": session.reboots,
+        "timesync rejected": session.clock.rejected,
+        "uwb frames": uwb.intake.received,
+        "uwb unusable": uwb.intake.skipped,
+        "packets received": sum(peer.received for _, peer in opener.peers.items()),
+        "packets lost": sum(peer.lost for _, peer in opener.peers.items()),
+    }
+    tables: Iterable[tuple[str, dict[str, int]]] = (
+        ("", dict(core.counters)),
+        ("mavlink ignored ", dict(session.ignored)),
+        ("mavlink bad ", dict(decoder.bad)),
+        ("mavlink refused ", {} if decoder.signing is None else dict(decoder.signing.refused)),
+        ("skipped ", dict(session.samples.skipped)),
+        ("skipped ", dict(core.timeline.skipped)),
+        ("skipped uwb ", dict(uwb.skipped)),
+        ("gps latency ", dict(core.gps_latency.counters)),
+        ("refused ", dict(core.records.refused)),
+        ("rejected uwb ", uwb.intake.rejections.as_dict()),
+        ("rejected ", opener.peers.rejections()),
+    )
+    for prefix, table in tables:
+        counters |= {f"{prefix}{name}"[:MAX_NAME]: count for name, count in table.items()}
+    return counters
+
+
+def gauges_of(core: AgentCore, session: AutopilotSession, now_s: float) -> dict[str, float]:
+    """What is measured at this moment; what is not known is left out."""
+    rates = {f"rate_{mid}_hz": stream.rate_hz for mid, stream in session.rates.streams.items()}
+    gauges = {
+        "rtt_s": session.clock.rtt_s,
+        "gps_fix_type": float(session.samples.fix_type),
+        "gps_age_s": core.gps_age_s(now_s),
+        "gps_latency_s": core.gps_latency.latency_s,
+        "gps_latency_sigma_s": core.gps_latency.sigma_s,
+        **rates,
+    }
+    return {name: value for name, value in gauges.items() if value is not None and math.isfinite(value)}
+
+
+def neighbour_gauges(opener: Opener, core: AgentCore, host_s: float, now_s: float) -> dict[str, dict[str, float]]:
+    """The state of each neighbour's link by id; the opener keeps host time, the core fleet time."""
+    peers = {str(agent_id): peer.as_dict(host_s) for agent_id, peer in opener.peers.items()}
+    for agent_id, age_s in core.neighbours.ages_s(now_s).items():
+        peers[str(agent_id)]["heard_age_s"] = age_s
+    return {agent_id: peers[agent_id] for agent_id in peers if int(agent_id) in core.neighbours}
+
+
+def diagnostics_of(
+    agent_id: int,
+    core: AgentCore,
+    counters: dict[str, int],
+    gauges: dict[str, float],
+    neighbours: dict[str, dict[str, float]],
+) -> Diagnostics:
+    """The message that goes out; of very many neighbours the first ones, as many as fit into it."""
+    health = core.health.health
+    reasons = tuple(reason[:MAX_REASON] for reason in health.reasons)
+    message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges)
+    return msgspec.structs.replace(message, neighbours=_fitting(neighbours, len(msgspec.json.encode(message))))
+
+
+def _fitting(neighbours: dict[str, dict[str, float]], taken_bytes: int) -> dict[str, dict[str, float]]:
+    """Neighbours for whom a body has room that already holds so many bytes."""
+    left_bytes = MAX_BODY_BYTES[Kind.DIAG] - taken_bytes - len(',"neighbours":{}')
+    fitting: dict[str, dict[str, float]] = {}
+    for agent_id, gauges in neighbours.items():
+        left_bytes -= len(msgspec.json.encode({agent_id: gauges})) - len("{}") + len(",")
+        if left_bytes < 0 or len(fitting) == MAX_NEIGHBOURS:
+            break
+        fitting[agent_id] = gauges
+    return fitting

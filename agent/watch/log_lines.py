@@ -1,0 +1,88 @@
+"""Log lines on stderr, and in files where they are asked for: state changes and faults, details on demand."""
+
+from __future__ import annotations
+
+import logging
+import sys
+from collections.abc import Callable
+from logging.handlers import RotatingFileHandler
+from pathlib import Path
+
+from agent.config.observer_tables import LogTable
+from agent.errors import RecordError
+from agent.log.disk import free_bytes
+
+LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
+LINE = "%(asctime)s %(levelname)s %(message)s"
+DISK_CHECK_PERIOD_S = 1.0
+
+
+def configure_logging(verbosity: int = 1, file: logging.Handler | None = None) -> None:
+    """Send the log to stderr, and to ``file``; 0 = faults only, 1 = state changes too, 2 = everything."""
+    logger = logging.getLogger("fleetloc")
+    for former in logger.handlers:
+        former.close()
+    logger.handlers[:] = [logging.StreamHandler(sys.stderr), *([file] if file else [])]
+    for handler in logger.handlers:
+        handler.setFormatter(logging.Formatter(LINE))
+    logger.setLevel(LEVELS[min(max(verbosity, 0), len(LEVELS) - 1)])
+    logger.propagate = False
+
+
+def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_bytes) -> logging.Handler | None:
+    """The log file of an agent, ``None`` where none is asked for; raises `RecordError` if it cannot be written."""
+    if table.directory is None:
+        return None
+    path = Path(table.directory) / f"agent_{agent_id:03d}.log"
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        limits = round(table.max_mb * 1e6), table.keep, round(table.min_free_mb * 1e6)
+        return LimitedLogFile(path, *limits, free)
+    except OSError as error:
+        raise RecordError(f"log {path}: cannot be written: {error.strerror or error}") from error
+
+
+class LimitedLogFile(RotatingFileHandler):
+    """A log file that is put aside at a size, and that gives way when the disk fills up.
+
+    With less than ``min_free_bytes`` left, files put aside go, the oldest first; if that is not enough, lines are
+    dropped (and counted in ``dropped``) until there is room again, which the file then says.
+    """
+
+    def __init__(
+        self, path: Path, max_bytes: int, keep: int, min_free_bytes: int, free: Callable[[Path], int] = free_bytes
+    ) -> None:
+        """Open it for appending; raises `OSError`."""
+        super().__init__(path, maxBytes=max_bytes, backupCount=keep, encoding="utf-8")
+        self._path = path
+        self._min_free_bytes = min_free_bytes
+        self._free = free
+        self._room = True
+        self._checked_s = float("-inf")
+        self.dropped = 0
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Write a line, unless the disk is nearly full."""
+        if abs(record.created - self._checked_s) >= DISK_CHECK_PERIOD_S:  # either way: clocks step
+            self._checked_s = record.created
+            self._room = self._make_room()
+        if not self._room:
+            self.dropped += 1
+            return
+        if self.dropped:
+            lost = f"{self.dropped} lines lost: the disk had less than log.min_free_mb left"
+            self.dropped = 0
+            super().emit(logging.LogRecord(record.name, logging.WARNING, "", 0, lost, None, None))
+        super().emit(record)
+
+    def _make_room(self) -> bool:
+        """Whether enough is left, after files put aside were deleted if need be."""
+        try:
+            for number in range(self.backupCount, -1, -1):
+                if self._free(self._path.parent) >= self._min_free_bytes:
+                    return True
+                if number:
+                    Path(f"{self._path}.{number}").unlink(missing_ok=True)
+        except OSError:
+            return False  # a folder that is gone has no room either
+        return False

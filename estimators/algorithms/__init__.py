@@ -1,0 +1,1 @@
+"""The estimators themselves, one assembly a file."""

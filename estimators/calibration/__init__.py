@@ -1,0 +1,1 @@
+"""What sensors get wrong and flight data can correct: their latency."""

@@ -1,0 +1,1 @@
+"""Compiled kernels: how they are declared, cached and linked, and their linear algebra."""

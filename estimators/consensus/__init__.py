@@ -1,0 +1,1 @@
+"""What neighbours exchange about the past: information pairs, weights, inheritance."""

@@ -1,0 +1,148 @@
+"""Consensus without dilution: take from a neighbour only what it knows better.
+
+A convex combination of information pairs dilutes an agent's own block by neighbours that know it less. When
+records are shared, neighbours mostly hold the same information, and what is lost to one of them is the rows of
+some agents. So for those agents, D, whose marginal the neighbour knows better, its conditional density of D given
+the other agents S takes the place of the own one:
+
+    p(x_S, x_D) = p_own(x_S) p_neighbour(x_D | x_S)
+
+The own marginal on S is untouched, and no datum enters it a second time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from math import isnan
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.compiled.entries import entry, kernel
+from estimators.compiled.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
+from estimators.consensus.information import fits
+from estimators.estimator import Payload, symmetrised
+from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.measurements import Matrix, Vector
+
+WORTHWHILE_NATS = 0.2
+"""Difference in log determinant of a 6x6 marginal covariance from which on a neighbour knows an agent better."""
+
+
+def survey(
+    own: Matrix, pairs: Mapping[int, Payload], slot: int, threshold: float = WORTHWHILE_NATS
+) -> tuple[dict[int, Payload], bool]:
+    """Of neighbours' pairs, by slot, those that can be fused, and whether one of them knows an agent better.
+
+    The best informed first, whatever its place: what is made of them does not depend on the agents' order. ``own``
+    ``(6n, 6n)`` is the own information, of the same tick; ``slot`` the own place, which nobody knows better.
+    """
+    n = len(own)
+    fitting = [each for each, pair in pairs.items() if fits(pair, n)]
+    informations, vectors = np.empty((len(fitting), n, n)), np.empty((len(fitting), n))
+    for place, each in enumerate(fitting):
+        informations[place], vectors[place] = pairs[each].information, pairs[each].vector
+    log_dets = np.empty(len(fitting))
+    better = _compare(np.ascontiguousarray(own), informations, vectors, slot, threshold, log_dets)
+    known = {each: known for each, known in zip(fitting, log_dets.tolist(), strict=True) if not isnan(known)}
+    return {each: pairs[each] for each in sorted(known, key=known.__getitem__, reverse=True)}, better
+
+
+@entry("boolean(float64[:, ::1], float64[:, :, ::1], float64[:, ::1], int64, float64, float64[::1])")
+def _compare(
+    own: Matrix, informations: NDArray[np.float64], vectors: Matrix, slot: int, threshold: float, log_dets: Vector
+) -> bool:
+    """Whether one of the pairs knows another agent than ``slot`` better than ``own``.
+
+    ``log_dets`` ``(J,)`` gets the informations' log determinants, NaN for a pair that cannot be fused.
+    """
+    n = own.shape[0]
+    agents = n // STATES_PER_AGENT
+    root, covariance, uncertainty = own.copy(), np.empty((n, n)), np.full(agents, -np.inf)
+    if factor_upper(root):
+        inverse_from_cholesky(root, covariance)
+        for k in range(agents):
+            uncertainty[k] = -np.inf if k == slot else _log_det(covariance, k)
+    better = False
+    for p in range(log_dets.shape[0]):
+        log_dets[p] = np.nan
+        root[:, :] = informations[p]
+        if not np.isfinite(vectors[p]).all() or not factor_upper(root):
+            continue
+        log_dets[p] = 0.0
+        for i in range(n):
+            log_dets[p] += 2.0 * np.log(root[i, i])
+        inverse_from_cholesky(root, covariance)
+        for k in range(agents):
+            better = better or uncertainty[k] - _log_det(covariance, k) > threshold
+    return better
+
+
+def inherit(
+    own: tuple[Matrix, Vector], other: tuple[Matrix, Vector], slot: int, threshold: float = WORTHWHILE_NATS
+) -> tuple[Matrix, Vector]:
+    """The own information pair, with the agents that ``other`` knows better taken from there.
+
+    ``slot`` is the own place, which is never taken. Pairs as in `estimators.estimator.Payload`.
+    Nothing is taken where one of them turns out not to be positive definite.
+    """
+    better = np.empty(len(own[1]) // STATES_PER_AGENT, np.bool_)
+    sound = _find_better(np.ascontiguousarray(own[0]), np.ascontiguousarray(other[0]), threshold, better)
+    better[slot] = False
+    if not sound or not better.any():
+        return own
+    return _transplant(own, other, symmetrised(np.linalg.inv(own[0])), np.repeat(better, STATES_PER_AGENT))
+
+
+@entry("boolean(float64[:, ::1], float64[:, ::1], float64, boolean[::1])")
+def _find_better(
+    own: Matrix, other: Matrix, threshold: float, better: np.ndarray[tuple[int], np.dtype[np.bool_]]
+) -> bool:
+    """Which agents' marginals the other information matrix knows better; False where one is not positive definite."""
+    n = own.shape[0]
+    covariance, other_covariance = np.empty((n, n)), np.empty((n, n))
+    for information, inverse in ((own, covariance), (other, other_covariance)):
+        root = information.copy()
+        if not factor_upper(root):
+            return False
+        inverse_from_cholesky(root, inverse)
+    for k in range(better.shape[0]):
+        gained = _log_det(covariance, k) - _log_det(other_covariance, k)
+        if np.isnan(gained):
+            return False
+        better[k] = gained > threshold
+    return True
+
+
+@kernel
+def _log_det(covariance: Matrix, slot: int) -> float:
+    """Log determinant of an agent's block; NaN where it is not positive definite."""
+    at = STATES_PER_AGENT * slot
+    root = covariance[at : at + STATES_PER_AGENT, at : at + STATES_PER_AGENT].copy()
+    if not cholesky_upper(root):
+        return np.nan
+    total = 0.0
+    for i in range(STATES_PER_AGENT):
+        total += np.log(root[i, i])
+    return 2.0 * total
+
+
+def _transplant(
+    own: tuple[Matrix, Vector],
+    other: tuple[Matrix, Vector],
+    covariance: Matrix,
+    taken: np.ndarray[tuple[int], np.dtype[np.bool_]],
+) -> tuple[Matrix, Vector]:
+    """Own marginal of the states not ``taken`` times the other's conditional of those taken."""
+    kept = ~taken
+    marginal = np.linalg.inv(covariance[np.ix_(kept, kept)])
+    conditional, cross = other[0][np.ix_(taken, taken)], other[0][np.ix_(taken, kept)]
+    regression = np.linalg.solve(conditional, cross)  # E[x_D | x_S] = a - regression x_S
+    information, vector = np.empty_like(own[0]), np.empty_like(own[1])
+    information[np.ix_(taken, taken)] = conditional
+    information[np.ix_(taken, kept)] = cross
+    information[np.ix_(kept, taken)] = cross.T
+    information[np.ix_(kept, kept)] = marginal + cross.T @ regression
+    vector[taken] = other[1][taken]
+    vector[kept] = marginal @ (covariance @ own[1])[kept] + regression.T @ other[1][taken]
+    return 0.5 * (information + information.T), vector

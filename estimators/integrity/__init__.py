@@ -1,0 +1,1 @@
+"""Whether an estimate can be trusted: observability, ambiguity, mirror images, consistency."""

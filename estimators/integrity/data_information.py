@@ -1,0 +1,118 @@
+"""What the data alone say of the fleet: the information filter without the prior.
+
+An estimate holds what was measured and what was believed at the start; where the data say nothing, the covariance
+of the second kind passes for knowledge. Here the same rows, linearised along the same path, are filtered from a
+start that knows nothing (an observability Gramian that forgets as the process noise says). A direction whose
+variance stays that of the start is not observable from what this agent has.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.compiled.entries import entry, kernel
+from estimators.compiled.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
+from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.measurements import ROW, Matrix, RowTable
+from estimators.model.motion import predict_information
+from estimators.model.row_kernels import IntArray
+from estimators.window.kernels import add_row_information
+from estimators.window.types import WindowProblem
+
+START_SIGMA_M = 100.0
+START_SIGMA_MPS = 10.0
+"""What stands for knowing nothing."""
+OBSERVABLE_SIGMA_M = 10.0
+"""Position sigma of an agent, along its worst direction, up to which the data say where it is."""
+
+
+def no_information(agents: int) -> Matrix:
+    """Information ``(6n, 6n)`` of a start that knows nothing."""
+    sigmas = np.repeat([START_SIGMA_M, START_SIGMA_MPS], 3)
+    return np.diag(np.tile(sigmas**-2.0, agents))
+
+
+class DataInformation:
+    """Information that the data gave at the start of an estimator's window."""
+
+    def __init__(self, agents: int) -> None:
+        self.information = no_information(agents)
+
+    def advance(self, problem: WindowProblem, path: Matrix, eps: float, *, slide: bool) -> NDArray[np.bool_]:
+        """Which agents the window's data and those before it observe ``(n,)``.
+
+        ``path`` ``(N+1, 6n)``: where rows are linearised. ``slide``: whether the window's start moves on by a tick.
+        """
+        following = np.empty_like(self.information)
+        observable = np.zeros(len(following) // STATES_PER_AGENT, np.bool_)
+        sound = _filter_information(
+            problem.rows,
+            problem.start,
+            problem.accel_variance,
+            np.ascontiguousarray(path),
+            problem.period_s,
+            eps,
+            self.information,
+            following,
+            observable,
+        )
+        if not sound:
+            self.information = no_information(len(observable))
+        elif slide:
+            self.information = following
+        return observable
+
+
+@entry(
+    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1],"
+    " float64[:, ::1], boolean[::1])",
+    ROW=ROW,
+)
+def _filter_information(
+    rows: RowTable,
+    start: IntArray,
+    accel_variance: Matrix,
+    path: Matrix,
+    dt: float,
+    eps: float,
+    information: Matrix,
+    following: Matrix,
+    observable: NDArray[np.bool_],
+) -> bool:
+    """`marginalization.filter_along` for the information alone, which depends on no value that was measured.
+
+    ``following`` gets that of the window's second tick before its rows, ``observable`` what its last tick allows.
+    False, and ``observable`` as it was, where the information is not positive definite.
+    """
+    info = information.copy()
+    ticks = accel_variance.shape[0]
+    for k in range(ticks):
+        add_row_information(rows[start[k] : start[k + 1]], path[k], eps, info)
+        if not predict_information(info, accel_variance[k], dt):
+            return False
+        if k == 0:
+            following[:, :] = info
+    add_row_information(rows[start[ticks] : start[ticks + 1]], path[ticks], eps, info)
+    if not factor_upper(info):
+        return False
+    covariance = np.empty_like(info)
+    inverse_from_cholesky(info, covariance)
+    mark_observable(covariance, observable)
+    return True
+
+
+@kernel
+def mark_observable(covariance: Matrix, observable: NDArray[np.bool_]) -> None:
+    """observable ``(n,)`` <- whose position is known along every direction, given a covariance without a prior.
+
+    No variance of a position reaches the limit where the limit's sphere less its covariance is positive definite.
+    """
+    room = np.empty((3, 3))
+    for s in range(observable.shape[0]):
+        p = STATES_PER_AGENT * s
+        for i in range(3):
+            for j in range(3):
+                room[i, j] = -covariance[p + i, p + j]
+            room[i, i] += OBSERVABLE_SIGMA_M**2
+        observable[s] = cholesky_upper(room)

@@ -1,0 +1,253 @@
+"""A Gaussian mixture over one drone's state: hypotheses about where it is, kept apart until data decide.
+
+A drone without position fixes is told where it is by ranges. One range leaves a sphere, two a circle, three a
+point and its mirror image in the plane of the neighbours: a single Gaussian linearised at one place cannot say
+that. Each component here is a second-order extended Kalman filter over the six states, its weight the likelihood
+of what was measured (Gaussian sum filter; Alspach and Sorenson, IEEE TAC 1972). All components are corrected at
+once, as arrays. NED, m and m/s.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from estimators.model.measurements import Matrix, Vector
+from estimators.model.motion import input_matrix, transition_matrix
+from estimators.model.row_kernels import IntArray
+
+PRUNED_NATS = 12.0
+"""Components less likely than the likeliest by more than this (a factor of 1.6e5) are given up."""
+MERGED_SQUARE = 2.0
+"""Squared Mahalanobis distance over the six states below which two components say the same; the parts of a split
+are 9 apart."""
+MOST = 128
+"""Components at most: nothing is split beyond it."""
+SPLIT_SHIFT = 1.5
+"""How far, in sigma, the outer two of three parts are moved; each is half as wide, their weights 1/6, 2/3, 1/6."""
+LEANING = 1e-3
+"""Preference among axes along which a component is equally wide: which one is taken must not depend on north."""
+
+
+@dataclass(slots=True)
+class Mixture:
+    """K components; the weights sum to one after `reduce`."""
+
+    log_weights: Vector
+    """``(K,)``."""
+    means: Matrix
+    """``(K, 6)``."""
+    covariances: Matrix
+    """``(K, 6, 6)``."""
+
+    @classmethod
+    def single(cls, mean: Vector, covariance: Matrix) -> Mixture:
+        """One component, certain."""
+        return cls(np.zeros(1), np.array(mean, float)[None], np.array(covariance, float)[None])
+
+    def copy(self) -> Mixture:
+        """One that can be changed without this one."""
+        return Mixture(self.log_weights.copy(), self.means.copy(), self.covariances.copy())
+
+    @property
+    def evidence(self) -> float:
+        """Logarithm of the sum of the weights: of the likelihood of the data since they summed to one."""
+        top = float(self.log_weights.max())
+        return top + float(np.log(np.exp(self.log_weights - top).sum()))
+
+    @property
+    def weights(self) -> Vector:
+        """``(K,)``, summing to one."""
+        scaled = np.exp(self.log_weights - self.log_weights.max())
+        return np.asarray(scaled / scaled.sum(), np.float64)
+
+    def likeliest(self) -> tuple[float, Vector, Matrix]:
+        """Weight, mean ``(6,)`` and covariance ``(6, 6)`` of the likeliest component."""
+        best = int(np.argmax(self.log_weights))
+        return float(self.weights[best]), self.means[best], self.covariances[best]
+
+    def second_moment(self, about: Vector) -> Matrix:
+        """E[(x - about)(x - about)'] ``(6, 6)``: how wrong an estimate ``about`` ``(6,)`` may be."""
+        away = self.means - about
+        each = self.covariances + away[:, :, None] * away[:, None, :]
+        return np.asarray(np.einsum("k,kij->ij", self.weights, each), np.float64)
+
+
+def predict(mixture: Mixture, accel: Vector, accel_variance: Vector, period_s: float) -> None:
+    """Move all components over a tick with an acceleration ``(3,)`` in m/s2 and its variances."""
+    transition, push = transition_matrix(1, period_s), input_matrix(1, period_s)
+    mixture.means = mixture.means @ transition.T + push @ accel
+    noise = (push * accel_variance) @ push.T
+    mixture.covariances = transition @ mixture.covariances @ transition.T + noise
+
+
+def correct_linear(mixture: Mixture, slope: Vector, value: float, variance: float) -> None:
+    """Correct with a scalar ``slope . x`` + noise."""
+    innovation = value - mixture.means @ slope
+    gain = mixture.covariances @ slope
+    _update(mixture, gain, gain @ slope + variance, innovation)
+
+
+def correct_range(
+    mixture: Mixture, place: Vector, place_covariance: Matrix, value_m: float, variance: float, offset_s: float = 0.0
+) -> None:
+    """Correct with a range to a body whose state ``(6,)`` is known with a covariance; fixed anchors have none.
+
+    Second order: the mean and the variance of what the linearisation misses are in the innovation.
+    """
+    lever = np.array([1.0, 1.0, 1.0, offset_s, offset_s, offset_s])
+    means, spread = mixture.means * lever, mixture.covariances * np.outer(lever, lever)
+    there, there_spread = place * lever, place_covariance * np.outer(lever, lever)
+    own = spread[:, :3, :3] + spread[:, 3:, :3] + spread[:, :3, 3:] + spread[:, 3:, 3:]
+    other = there_spread[:3, :3] + there_spread[3:, :3] + there_spread[:3, 3:] + there_spread[3:, 3:]
+    away = means[:, :3] + means[:, 3:] - there[:3] - there[3:]
+    distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-6)
+    unit = away / distance[:, None]
+    bent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / distance[:, None, None] @ (own + other)
+    predicted = distance + 0.5 * np.einsum("kii->k", bent)
+    missed = 0.5 * np.einsum("kij,kji->k", bent, bent)
+    slope = np.concatenate([unit, offset_s * unit], axis=-1)
+    gain = np.einsum("kij,kj->ki", mixture.covariances, slope)
+    known = np.einsum("ki,ij,kj->k", unit, other, unit)
+    total = np.einsum("ki,ki->k", slope, gain) + known + missed + variance
+    _update(mixture, gain, total, value_m - predicted)
+
+
+def _update(mixture: Mixture, gain: Matrix, variance: Vector, innovation: Vector) -> None:
+    """Kalman update with unscaled gains ``(K, 6)``, innovation variances and innovations ``(K,)``."""
+    mixture.log_weights = mixture.log_weights - 0.5 * (innovation**2 / variance + np.log(variance))
+    mixture.means = mixture.means + gain * (innovation / variance)[:, None]
+    reduced = mixture.covariances - gain[:, :, None] * gain[:, None, :] / variance[:, None, None]
+    mixture.covariances = 0.5 * (reduced + reduced.transpose(0, 2, 1))
+
+
+def reduce(mixture: Mixture) -> None:
+    """Normalise, give up unlikely components, merge those that say the same (moments are kept)."""
+    order = np.argsort(-mixture.log_weights, kind="stable")[:MOST]
+    order = order[mixture.log_weights[order] > mixture.log_weights[order[0]] - PRUNED_NATS]
+    weights, means = mixture.weights[order], mixture.means[order]
+    covariances = mixture.covariances[order]
+    left = np.ones(len(order), bool)
+    merged: list[tuple[float, Vector, Matrix]] = []
+    for k in range(len(order)):
+        if not left[k]:
+            continue
+        away = means - means[k]
+        near = left & (np.einsum("ki,ki->k", away, np.linalg.solve(covariances[k], away.T).T) < MERGED_SQUARE)
+        near[k] = True
+        left &= ~near
+        share = weights[near] / weights[near].sum()
+        mean = share @ means[near]
+        off = means[near] - mean
+        spread = np.einsum("k,kij->ij", share, covariances[near] + off[:, :, None] * off[:, None, :])
+        merged.append((float(weights[near].sum()), mean, spread))
+    total = sum(weight for weight, _, _ in merged)
+    mixture.log_weights = np.log([weight / total for weight, _, _ in merged])
+    mixture.means = np.array([mean for _, mean, _ in merged])
+    mixture.covariances = np.array([spread for _, _, spread in merged])
+
+
+def on_sphere(
+    mean: Vector, covariance: Matrix, centre: Vector, radius_m: float, radial_variance: float, forward: Vector
+) -> Mixture:
+    """A wide Gaussian cut to patches of a sphere about ``centre`` ``(3,)``, each small against the radius.
+
+    The patches are a Fibonacci lattice whose first point lies towards the mean and whose turn is given by
+    ``forward`` ``(3,)``, so that a rotated problem gives the rotated patches. Each patch is fused with the Gaussian,
+    which weighs it; the range itself is thereby used, with its variance ``radial_variance``.
+    """
+    directions = _lattice(SPHERE_PATCHES) @ _frame(mean[:3] - centre, forward)
+    tangential = (radius_m * PATCH_SIGMA) ** 2
+    bend = tangential / radius_m
+    radial = radial_variance + bend * bend
+    outer = directions[:, :, None] * directions[:, None, :]
+    patches = tangential * np.eye(3) + (radial - tangential) * outer
+    points = centre + (radius_m - bend) * directions  # a patch of a tangent plane lies outside the sphere on average
+    total = covariance[:3, :3] + patches
+    away = points - mean[:3]
+    gain = covariance[:, :3] @ np.linalg.inv(total)
+    square = np.einsum("ki,ki->k", away, np.linalg.solve(total, away[:, :, None])[:, :, 0])
+    fused = covariance - gain @ covariance[:3, :]
+    return Mixture(
+        -0.5 * (square + np.linalg.slogdet(total)[1]),
+        mean + np.einsum("kij,kj->ki", gain, away),
+        0.5 * (fused + fused.transpose(0, 2, 1)),
+    )
+
+
+SPHERE_PATCHES = 64
+PATCH_SIGMA = float(np.sqrt(np.pi / SPHERE_PATCHES))
+"""Sigma of a patch against the radius: half the distance of its neighbours in the lattice."""
+
+
+def _lattice(count: int) -> Matrix:
+    """Directions ``(count, 3)`` spread evenly over the sphere, the first along the first axis."""
+    k = np.arange(count)
+    along = 1.0 - 2.0 * k / (count - 1.0)
+    turn = k * np.pi * (3.0 - np.sqrt(5.0))
+    across = np.sqrt(np.maximum(1.0 - along**2, 0.0))
+    return np.stack([along, across * np.cos(turn), across * np.sin(turn)], axis=-1)
+
+
+def _frame(first: Vector, second: Vector) -> Matrix:
+    """Right-handed axes as rows ``(3, 3)``: along ``first``, then ``second`` as far as it is not along it."""
+    axes: list[Vector] = []
+    for candidate in (first, second, *np.eye(3)):
+        for axis in axes:
+            candidate = candidate - (candidate @ axis) * axis
+        length = np.linalg.norm(candidate)
+        if length > 1e-3:
+            axes.append(candidate / length)
+        if len(axes) == 2:
+            break
+    return np.array([axes[0], axes[1], np.cross(axes[0], axes[1])])
+
+
+def split(mixture: Mixture, centre: Vector, widest_m: float, forward: Vector) -> None:
+    """Cut components in three, keeping their moments, until none is wider than ``widest_m`` across a range.
+
+    Wide is the sigma of the position at right angles to the direction from ``centre`` ``(3,)``; the rest of the
+    state moves with it as their correlation says. ``forward`` ``(3,)`` decides among equally wide axes.
+    """
+    while True:
+        away = mixture.means[:, :3] - centre
+        unit = away / np.maximum(np.linalg.norm(away, axis=-1), 1e-6)[:, None]
+        across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
+        seen = across @ mixture.covariances[:, :3, :3] @ across
+        lean = across @ forward / max(float(np.linalg.norm(forward)), 1e-6)
+        size = np.einsum("kii->k", seen)
+        values, axes = np.linalg.eigh(seen + LEANING * size[:, None, None] * lean[:, :, None] * lean[:, None, :])
+        axis = axes[:, :, 2]
+        wide = np.flatnonzero(np.einsum("ki,kij,kj->k", axis, seen, axis) > widest_m**2)
+        wide = wide[np.argsort(-mixture.log_weights[wide], kind="stable")][: (MOST - len(values)) // 2]
+        if not len(wide):
+            return
+        _cut(mixture, wide, axis[wide])
+
+
+def _cut(mixture: Mixture, which: IntArray, axis: Matrix) -> None:
+    """Cut the components ``which`` along the directions ``axis`` ``(len(which), 3)`` of their positions."""
+    chosen = mixture.covariances[which]
+    shift = np.einsum("kij,kj->ki", chosen[:, :, :3], axis)
+    shift /= np.sqrt(np.einsum("ki,ki->k", shift[:, :3], axis))[:, None]
+    inner = chosen - SPLIT_SHIFT**2 / 3.0 * shift[:, :, None] * shift[:, None, :]
+    sides = (1 / 6, -1.0), (2 / 3, 0.0), (1 / 6, 1.0)
+    parts = [(np.log(share), side * SPLIT_SHIFT * shift) for share, side in sides]
+    rest = np.setdiff1d(np.arange(len(mixture.log_weights)), which)
+    weights, means = mixture.log_weights[which], mixture.means[which]
+    mixture.log_weights = np.concatenate([mixture.log_weights[rest], *(weights + share for share, _ in parts)])
+    mixture.means = np.concatenate([mixture.means[rest], *(means + moved for _, moved in parts)])
+    mixture.covariances = np.concatenate([mixture.covariances[rest], inner, inner, inner])
+
+
+def is_sound(mixture: Mixture) -> bool:
+    """Whether all is finite and every variance positive."""
+    diagonal = np.einsum("kii->ki", mixture.covariances)
+    return bool(
+        len(mixture.log_weights)
+        and np.isfinite(mixture.log_weights).all()
+        and np.isfinite(mixture.means).all()
+        and np.isfinite(mixture.covariances).all()
+        and (diagonal > 0.0).all()
+    )

@@ -1,0 +1,1 @@
+"""What is estimated and measured: the state, how it moves, measurement rows with value, gradient and bound."""

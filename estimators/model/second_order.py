@@ -1,0 +1,128 @@
+"""What the linearisation of a range misses: the mean square of its second-order term.
+
+A range row is linearised at the estimated places of its two ends. With a relative position error delta of
+covariance D about an estimated distance rho along the unit vector u,
+
+    |r + delta| = rho + u' delta + 1/2 delta' T delta + ...,      T = (I - u u') / rho,
+
+and for Gaussian delta the neglected term has the mean square 1/2 tr(T D T D) + 1/4 tr(T D)^2 (second-order
+extended Kalman filter, e.g. Bar-Shalom, Li, Kirubarajan 2001, section 10.3; its mean is not corrected here). Where
+a place is known well against the distance it vanishes; where it is not, the row says next to nothing about a
+direction, and counting it with the sensor's variance alone makes the estimate overconfident for good, because
+what an arrival cost once holds is never linearised anew.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.compiled.entries import entry, kernel
+from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.measurements import ROW, Kind, Matrix, RowTable, Vector
+from estimators.model.row_kernels import IntArray
+from estimators.window.marginalization import filter_along
+
+SIGNIFICANT = 0.05
+"""Share of a row's variance below which what its linearisation misses is left out."""
+REWEIGHTINGS = 3
+"""How often the covariance and what the linearisation misses at it are computed from each other."""
+_RANGE, _ANCHOR_RANGE = int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
+
+
+@entry(
+    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64,"
+    " float64[:, ::1], float64[::1], ROW[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
+    ROW=ROW,
+)
+def filter_reweighted(
+    rows: RowTable,
+    start: IntArray,
+    accel: Matrix,
+    accel_variance: Matrix,
+    path: Matrix,
+    dt: float,
+    eps: float,
+    information: Matrix,
+    vector: Vector,
+    weighted: RowTable,
+    next_information: Matrix,
+    next_mean: Vector,
+    covariance: Matrix,
+) -> bool:
+    """`filter_along`, with rows whose variances hold what their linearisation misses where it is significant.
+
+    That follows from the covariance and it from that: iterated from the rows as they are, so that a place that the
+    data tell is not doubted for the prior's sake. ``weighted`` ``(m,)`` gets the rows with the variances found.
+    """
+    for r in range(rows.shape[0]):
+        weighted[r] = rows[r]
+    total = np.empty(rows.shape[0])
+    for _ in range(REWEIGHTINGS + 1):
+        if not filter_along(
+            weighted, start, accel, accel_variance, path, dt, eps,
+            information, vector, next_information, next_mean, covariance,
+        ):  # fmt: skip
+            return False
+        settled = True
+        for k in range(start.shape[0] - 1):
+            for r in range(start[k], start[k + 1]):
+                measured = rows[r]["variance"]
+                missed = linearisation_variance(rows[r], path[k], covariance, eps)
+                total[r] = measured + missed if missed > SIGNIFICANT * measured else measured
+                before = weighted[r]["variance"]
+                settled = settled and abs(total[r] - before) <= SIGNIFICANT * before
+        if settled:
+            break
+        for r in range(rows.shape[0]):
+            weighted[r]["variance"] = total[r]
+    return True
+
+
+@kernel
+def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps: float) -> float:
+    """Mean square in m2 of what a row's linearisation misses, 1/2 tr(TDTD) + 1/4 tr(TD)^2; zero but for ranges.
+
+    ``state`` ``(6n,)``: where the row is linearised; ``covariance`` ``(6n, 6n)`` of the fleet state; ``eps`` as in
+    the rows' smoothed norm, m.
+    """
+    if row["kind"] != _RANGE and row["kind"] != _ANCHOR_RANGE:
+        return 0.0
+    away = np.empty(3)
+    spread = np.empty((3, 3))
+    bent = np.empty((3, 3))
+    a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
+    b = STATES_PER_AGENT * row["other"]  # negative for anchors
+    anchor = (row["x"], row["y"], row["z"])
+    for i in range(3):
+        there = state[b + i] + o * state[b + 3 + i] if b >= 0 else anchor[i]
+        away[i] = state[a + i] + o * state[a + 3 + i] - there
+        for j in range(3):
+            middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
+            ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
+            spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
+    distance = np.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + eps * eps)
+    for i in range(3):
+        for j in range(3):
+            bent[i, j] = 0.0
+            for k in range(3):
+                identity = 1.0 if i == k else 0.0
+                curvature = (identity - away[i] / distance * (away[k] / distance)) / distance
+                bent[i, j] += curvature * spread[k, j]
+    squares, trace = 0.0, 0.0
+    for i in range(3):
+        trace += bent[i, i]
+        for j in range(3):
+            squares += bent[i, j] * bent[j, i]
+    return float(0.5 * squares + 0.25 * trace * trace)
+
+
+@kernel
+def _relative(covariance: Matrix, a: int, b: int, i: int, j: int) -> float:
+    """Element of the covariance of the difference of two agents' states that begin at ``a`` and ``b``.
+
+    With ``b`` negative of the one at ``a`` alone.
+    """
+    value: float = covariance[a + i, a + j]
+    if b >= 0:
+        value = value + covariance[b + i, b + j] - covariance[a + i, b + j] - covariance[a + j, b + i]
+    return value

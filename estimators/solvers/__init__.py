@@ -1,0 +1,1 @@
+"""Minimisers: Gauss-Newton, the compiled active set, quadratic programs and their engines."""

@@ -1,0 +1,67 @@
+"""Filtered arrival cost: the information on a window's second state from all that the window drops.
+
+The paper's arrival cost (17)-(18) already holds the rows of the next window's first tick and a smoothed mean,
+which are then used again. Here the dropped tick is marginalised: its rows, linearised at the smoothed state,
+enter the information pair, which is then predicted. Nothing is used twice, so that on a linear system the
+estimator is the Kalman filter.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from estimators.algorithms.dekf_ci import add_corrections
+from estimators.compiled.entries import kernel
+from estimators.compiled.linear_algebra import cholesky_solve, factor_upper, inverse_from_cholesky
+from estimators.model.measurements import Matrix, RowTable, Vector
+from estimators.model.motion import predict_information, predict_state
+from estimators.model.row_kernels import IntArray
+
+
+@kernel
+def filter_along(
+    rows: RowTable,
+    start: IntArray,
+    accel: Matrix,
+    accel_variance: Matrix,
+    path: Matrix,
+    dt: float,
+    eps: float,
+    information: Matrix,
+    vector: Vector,
+    next_information: Matrix,
+    next_mean: Vector,
+    covariance: Matrix,
+) -> bool:
+    """Run the information filter through a window, every tick linearised at the smoothed ``path``.
+
+    ``path`` ``(N+1, 6n)``; ``information``, ``vector`` are the prior pair at the window's start.
+    ``next_information``, ``next_mean`` get information and mean one tick later, before that tick's rows;
+    ``covariance`` ``(6n, 6n)`` that of the last state. False where a pair is not positive definite.
+    """
+    n = vector.shape[0]
+    info = information.copy()
+    pair = vector.copy()
+    mean = np.empty(n)
+    ticks = accel.shape[0]
+    for k in range(ticks + 1):
+        add_corrections(rows[start[k] : start[k + 1]], path[k], eps, info, pair)
+        root = info.copy()
+        if not factor_upper(root):
+            return False
+        if k == ticks:
+            inverse_from_cholesky(root, covariance)
+            break
+        mean[:] = pair
+        cholesky_solve(root, mean)
+        predict_state(mean, accel[k], dt, mean)
+        if not predict_information(info, accel_variance[k], dt):
+            return False
+        for i in range(n):
+            pair[i] = 0.0
+            for j in range(n):
+                pair[i] += info[i, j] * mean[j]
+        if k == 0:
+            next_information[:, :] = info
+            next_mean[:] = mean
+    return True

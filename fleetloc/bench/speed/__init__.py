@@ -1,0 +1,1 @@
+"""The speed study: our step against other solvers on the same windows."""

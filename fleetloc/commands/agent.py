@@ -1,0 +1,83 @@
+"""``fleetloc agent``: the daemon of one drone."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from fleetloc.errors import FleetlocError
+from fleetloc.options import FleetFile, Overrides, Profiles
+
+
+class NotStarted(FleetlocError):
+    """The daemon cannot be started; the exit code is one of `agent.exit_codes`."""
+
+    def __init__(self, message: str, exit_code: int) -> None:
+        super().__init__(message)
+        self.exit_code = exit_code
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("agent")(agent)
+
+
+def agent(
+    config: FleetFile,
+    agent_id: Annotated[int, typer.Option("--id", help="Which of its agents this is.")],
+    profiles: Profiles = None,
+    overrides: Overrides = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Write the record here; earlier ones are kept beside it.")
+    ] = None,
+    verbose: Annotated[int, typer.Option("--verbose", "-v", count=True, help="Say more on stderr.")] = 0,
+    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say faults only.")] = False,
+) -> None:
+    """Run the daemon of one drone until SIGTERM or SIGINT.
+
+    Exit codes: 0 stopped, 1 a fault of the program, 2 wrong usage, 3 configuration, 4 autopilot's link, 5 keys,
+    6 session with the other agents, 7 no autopilot appeared, 8 record, 9 what has to outlive a restart (disk full).
+    """
+    import logging
+    import time
+
+    from agent.config.reading import load_config
+    from agent.daemon import run
+    from agent.errors import ConfigError, RecordError
+    from agent.exit_codes import ExitCode
+    from agent.sensing.clock import require_epoch
+    from agent.watch.log_lines import configure_logging, log_file
+    from agent.watch.observer_list import observers_of
+    from estimators.factory import make_estimator
+    from fleetloc.run.run_files import keep_earlier_record
+    from fleetloc.warmup import announce
+    from transport.errors import KeyFileError
+
+    settings = list(overrides or ())
+    if out is not None:
+        settings.append(f"record.directory={out}")
+    try:
+        fleet = load_config(config, settings, profiles or ())
+        unset = require_epoch(fleet.fleet, str(config), unix_s=time.time())
+    except ConfigError as error:
+        raise NotStarted(str(error), ExitCode.CONFIG) from error
+    try:
+        configure_logging(0 if quiet else 1 + verbose, log_file(fleet.log, agent_id))
+        observers = observers_of(fleet, agent_id, config.parent) if agent_id in fleet.ids else []
+    except RecordError as error:
+        raise NotStarted(str(error), ExitCode.RECORD) from error
+    except ConfigError as error:
+        raise NotStarted(str(error), ExitCode.CONFIG) from error
+    except KeyFileError as error:
+        raise NotStarted(str(error), ExitCode.KEYS) from error
+    if unset is not None:
+        logging.getLogger("fleetloc.agent").warning("agent %d: %s; nothing is sent until it is set", agent_id, unset)
+    announce()
+    if fleet.record.directory is not None:
+        try:
+            keep_earlier_record(Path(fleet.record.directory), agent_id)
+        except OSError as error:
+            raise NotStarted(f"record {fleet.record.directory}: {error.strerror}", ExitCode.RECORD) from error
+    raise typer.Exit(run(fleet, agent_id, make_estimator, base=config.parent, observers=observers))

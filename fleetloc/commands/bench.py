@@ -1,0 +1,276 @@
+"""``fleetloc bench``: studies of the estimators."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal
+
+import typer
+
+from fleetloc.bench.fusion_command import fusion
+
+if TYPE_CHECKING:
+    from fleetloc.bench.sweep import Point
+    from sim_bridge.studies.study_scenario import Scenario
+
+Runs = Annotated[int, typer.Option(min=1, help="Monte Carlo runs, the same for all methods.")]
+Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
+Period = Annotated[float, typer.Option(min=0.001, help="Length of a tick, s.")]
+Samples = Annotated[int, typer.Option(min=1, help="Ticks after the first.")]
+OtherAccel = Annotated[
+    float, typer.Option(min=1e-9, help="Variance (m/s2)^2 assumed for accelerations that are not known.")
+]
+StartKind = Annotated[Literal["paper", "good"], typer.Option(help="Estimates at zero, or drawn around the truth.")]
+JsonFile = Annotated[Path | None, typer.Option("--json", help="Write the results to this file.")]
+OutFolder = Annotated[Path | None, typer.Option("--out", help="Folder for the plots (PNG) and results.json.")]
+Jobs = Annotated[int, typer.Option(min=0, max=256, help="Processes at a time; 0: one per processor.")]
+Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: all.")]
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command group to the command line."""
+    bench = typer.Typer(
+        help="Studies: accuracy, links, blind drones, partition, Table I of the paper, speed.", rich_markup_mode=None
+    )
+    bench.callback()(_group)
+    bench.command("table1")(table1)
+    bench.command("accuracy")(accuracy)
+    bench.command("loss")(loss)
+    bench.command("blind")(blind)
+    bench.command("partition")(partition)
+    bench.command("speed")(speed)
+    bench.command("fusion")(fusion)
+    app.add_typer(bench, name="bench")
+
+
+def _group() -> None:
+    """Studies of the estimators; every one takes --seed and --json."""
+
+
+def table1(
+    runs: Runs = 20,
+    seed: Seed = 0,
+    period: Period = 0.1,
+    samples: Samples = 50,
+    other_accel_variance: OtherAccel = 0.02,
+    start: StartKind = "paper",
+    json_file: JsonFile = None,
+) -> None:
+    """Table I of Borelle et al. 2023: four distributed estimators on the paper's fleet of three."""
+    from fleetloc.bench.accuracy import table1 as study
+    from fleetloc.output import write_json
+    from fleetloc.warmup import announce
+
+    announce()
+    results = study(
+        runs=runs,
+        seed=seed,
+        period_s=period,
+        samples=samples,
+        other_accel_variance=other_accel_variance,
+        start=start,
+    )
+    if json_file is not None:
+        write_json(json_file, results)
+
+
+def accuracy(
+    runs: Runs = 20,
+    seed: Seed = 0,
+    graph: Annotated[str, typer.Option(help="line, triangle, line4..10, ring4..10 or K4..10.")] = "line",
+    period: Period = 0.1,
+    samples: Samples = 70,
+    other_accel_variance: OtherAccel = 4.0 / 3.0,
+    start: StartKind = "good",
+    blind: Annotated[int, typer.Option(min=0, help="Agents without GPS, from the last backwards.")] = 0,
+    methods: Methods = "",
+    agents: Annotated[str, typer.Option(help="Repeat with fleets of these sizes (3..10), by commas.")] = "",
+    family: Annotated[Literal["line", "ring", "K"], typer.Option(help="Graphs of --agents.")] = "ring",
+    gps_shares: Annotated[str, typer.Option(help="Repeat with these shares of drones with GPS, by commas.")] = "",
+    start_offsets: Annotated[
+        str, typer.Option(help="Repeat with every position of the start so many m off (P0 knows), by commas.")
+    ] = "",
+    jobs: Jobs = 0,
+    out: OutFolder = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Accuracy and consistency (ANEES) of all estimators on the same runs, also along a few axes."""
+    from fleetloc.bench.accuracy import accuracy as study
+    from fleetloc.bench.methods import chosen, default_methods
+    from fleetloc.errors import InputError
+    from sim_bridge.studies.study_scenario import GRAPHS, Scenario
+
+    if graph not in GRAPHS:
+        raise InputError("--graph", "", f"one of {', '.join(GRAPHS)}", graph)
+    if blind > GRAPHS[graph][0]:
+        raise InputError("--blind", "", f"at most {GRAPHS[graph][0]} agents", str(blind))
+    if start == "paper" and start_offsets:
+        raise InputError("--start-offsets", "", "the good start", "the paper's")
+    scenario = Scenario(graph, samples, period, start, blind)
+    sweeps = _sweeps(scenario, agents, family, gps_shares, start_offsets)
+    selected = chosen(default_methods(other_accel_variance), methods)
+    folder = _prepare(out)
+    results = study(
+        runs=runs, seed=seed, scenario=scenario, methods=selected, sweeps=sweeps, jobs=_jobs(jobs), out=folder
+    )
+    _write(results, folder, json_file)
+
+
+def _sweeps(scenario: Scenario, agents: str, family: str, gps_shares: str, start_offsets: str) -> list[Point]:
+    from fleetloc.bench.accuracy import sweep_points
+
+    return sweep_points(
+        scenario,
+        family,
+        _whole_numbers("--agents", agents, 3, 10),
+        _numbers("--gps-shares", gps_shares, 0.0, 1.0),
+        _numbers("--start-offsets", start_offsets, 0.0, 1000.0),
+    )
+
+
+def loss(
+    runs: Runs = 20,
+    seed: Seed = 0,
+    link_seed: Annotated[int | None, typer.Option(min=0, help="Of the links' draws alone; default: --seed.")] = None,
+    losses: Annotated[str, typer.Option(help="Probabilities, separated by commas.")] = "0,0.1,0.3,0.5,0.8,0.9",
+    delays: Annotated[str, typer.Option(help="Ticks, separated by commas.")] = "1,2,3,5",
+    channels: Annotated[
+        str, typer.Option(help="Of bursts, jitter, duplicates, one-way, fu: by commas.")
+    ] = "bursts,jitter,duplicates,one-way,fu",
+    methods: Methods = "",
+    jobs: Jobs = 0,
+    out: OutFolder = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Accuracy and consistency when packets are lost, late, doubled or out of order, beside what could be known."""
+    from fleetloc.bench.links import CHANNELS
+    from fleetloc.bench.links import loss as study
+    from fleetloc.bench.methods import chosen, methods_with_genie
+    from fleetloc.errors import InputError
+
+    names = [name.strip() for name in channels.split(",") if name.strip()]
+    if not set(names) <= set(CHANNELS):
+        raise InputError("--channels", "", f"some of {', '.join(CHANNELS)}", channels)
+    probabilities = _numbers("--losses", losses, 0.0, 0.99)
+    ticks = _whole_numbers("--delays", delays, 0, 50)
+    selected = chosen(methods_with_genie(), methods)
+    folder = _prepare(out)
+    results = study(
+        runs=runs, seed=seed, losses=probabilities, delays_ticks=ticks, channels=names, methods=selected,
+        jobs=_jobs(jobs), link_seed=link_seed, out=folder,
+    )  # fmt: skip
+    _write(results, folder, json_file)
+
+
+def blind(
+    runs: Runs = 20,
+    seed: Seed = 0,
+    methods: Methods = "dmhe_pre_ekf,dekf_ci_shared,dmhe_relay,centralized_iekf",
+    jobs: Jobs = 0,
+    json_file: JsonFile = None,
+) -> None:
+    """A drone without GPS in several graphs: its error, its consistency, and whether it says that it is lost."""
+    from fleetloc.bench.blind import blind as study
+    from fleetloc.bench.methods import chosen, default_methods
+
+    selected = chosen(default_methods(), methods)
+    _prepare(None)
+    _write(study(runs=runs, seed=seed, methods=selected, jobs=_jobs(jobs)), None, json_file)
+
+
+def partition(
+    runs: Runs = 20,
+    seed: Seed = 0,
+    length: Annotated[float, typer.Option(min=1.0, max=600.0, help="Of the partition, s.")] = 20.0,
+    moving: Annotated[
+        bool, typer.Option("--moving", help="Every 5 s to the next one's place; else they hover.")
+    ] = False,
+    keep_ranges: Annotated[
+        bool, typer.Option("--keep-ranges", help="Packets are cut, ranges between the islands are not.")
+    ] = False,
+    loss: Annotated[float, typer.Option(min=0.0, max=0.99, help="Of all packets, with the cut and without.")] = 0.1,
+    jobs: Jobs = 0,
+    out: OutFolder = None,
+    json_file: JsonFile = None,
+) -> None:
+    """A mesh of five falls apart into two and three and heals: are islands consistent, when do they agree again."""
+    from estimators.settings import default_settings
+    from fleetloc.bench.partition import Plan
+    from fleetloc.bench.partition import partition as study
+
+    turn_every_s = 5.0 if moving else None
+    plan = Plan(
+        default_settings(), seed, length_s=length, turn_every_s=turn_every_s, ranges_cut=not keep_ranges, loss=loss
+    )
+    folder = _prepare(out)
+    _write(study(plan, runs=runs, jobs=_jobs(jobs), out=folder), folder, json_file)
+
+
+def _prepare(out: Path | None) -> Path | None:
+    """Compile what is missing once, before several processes would wait for each other; make the folder."""
+    from fleetloc.errors import InputError
+    from fleetloc.warmup import announce
+
+    announce()
+    if out is not None:
+        try:
+            out.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError("--out", "", "a folder that can be written", f"{out} ({error.strerror})") from None
+    return out
+
+
+def _jobs(jobs: int) -> int:
+    from fleetloc.bench.sweep import default_jobs
+
+    return jobs or default_jobs()
+
+
+def _write(results: dict[str, Any], folder: Path | None, json_file: Path | None) -> None:
+    from fleetloc.output import write_json
+
+    if folder is not None:
+        write_json(folder / "results.json", results)
+    if json_file is not None:
+        write_json(json_file, results)
+
+
+def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
+    """A comma-separated list of numbers within bounds; raises `InputError`."""
+    from fleetloc.errors import InputError
+
+    expected = f"numbers from {low:g} to {high:g}, separated by commas"
+    try:
+        values = [float(part) for part in text.split(",") if part.strip()]
+    except ValueError:
+        raise InputError(option, "", expected, text) from None
+    if not all(low <= value <= high for value in values):
+        raise InputError(option, "", expected, text)
+    return values
+
+
+def _whole_numbers(option: str, text: str, low: int, high: int) -> list[int]:
+    """A comma-separated list of integers within bounds; raises `InputError`."""
+    from fleetloc.errors import InputError
+
+    values = _numbers(option, text, low, high)
+    if any(value != int(value) for value in values):
+        raise InputError(option, "", f"whole numbers from {low} to {high}, separated by commas", text)
+    return [int(value) for value in values]
+
+
+def speed(
+    seed: Seed = 0,
+    repeats: Annotated[int, typer.Option(min=1, help="Timed rounds over the windows, at most.")] = 30,
+    windows: Annotated[int, typer.Option(min=1, max=64, help="Different windows per size.")] = 8,
+    sizes: Annotated[str, typer.Option(help="AGENTSxWINDOW, separated by commas.")] = "3x2,5x5,10x5,20x5",
+    cases: Annotated[str, typer.Option(help="Of free, loose, active: separated by commas.")] = "free,loose,active",
+    json_file: JsonFile = None,
+) -> None:
+    """Time our step against IPOPT, SQP+OSQP, SLSQP, a plain numpy build and DEKF-CI on the same windows."""
+    from fleetloc.bench.speed.environment import use_one_thread
+
+    use_one_thread()  # before numpy comes in
+    from fleetloc.bench.speed.command import run_command
+
+    run_command(json_file, seed, repeats, windows, sizes, cases)

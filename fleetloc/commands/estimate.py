@@ -1,0 +1,98 @@
+"""``fleetloc estimate``: run an estimator over a tick-level recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+if TYPE_CHECKING:
+    from sim_bridge.studies.lockstep import LockstepResult
+    from sim_bridge.studies.recording import Recording
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("estimate")(estimate)
+
+
+def estimate(
+    recording: Annotated[Path, typer.Argument(help="Recording (.npz), see docs/recordings.md.")],
+    config: Annotated[
+        Path | None, typer.Option("--config", help="TOML file; only its [estimator] table is read.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", help="estimator.KEY=VALUE, beats the file; may be repeated.")
+    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Write mean, cov_diag and status here (.npz).")] = None,
+    json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
+) -> None:
+    """Run one estimator per agent over a recording, in lockstep, and print the errors where it holds the truth."""
+    from agent.config.reading import load_estimator_settings
+    from fleetloc.output import progress_bar, write_json
+    from fleetloc.warmup import announce
+    from sim_bridge.studies.lockstep import run_lockstep
+    from sim_bridge.studies.recording import load_recording
+
+    settings = load_estimator_settings(config, overrides or [])
+    fleet = load_recording(recording)
+    announce()
+    with progress_bar("ticks", fleet.ticks + 1) as advance:
+        result = run_lockstep(fleet, settings, lambda _tick: advance())
+    if out is not None:
+        _write(out, result)
+    figures = _figures(fleet, result)
+    _print(fleet, figures)
+    if json_file is not None:
+        write_json(json_file, {"recording": recording.name, "estimator": settings.kind, **figures})
+
+
+def _write(path: Path, result: LockstepResult) -> None:
+    import numpy as np
+
+    with path.open("wb") as file:
+        np.savez_compressed(file, mean=result.mean, cov_diag=result.cov_diag, status=result.status)
+
+
+def _figures(recording: Recording, result: LockstepResult) -> dict[str, Any]:
+    """What there is to say about a run, per agent, with units in the keys."""
+    import numpy as np
+
+    from estimators.estimator import Status
+    from estimators.integrity.consistency import rms
+    from estimators.model.layout import position, velocity
+
+    agents = []
+    for slot, agent_id in enumerate(recording.agents.tolist()):
+        row: dict[str, Any] = {"id": agent_id}
+        row["status"] = {
+            status.name.lower(): int(np.count_nonzero(result.status[:, slot] == status)) for status in Status
+        }
+        if recording.truth is not None and result.nees_full is not None:
+            own = result.mean[:, slot, :] - recording.truth.reshape(len(recording.truth), -1)
+            row["position_rmse_m"] = rms(own[1:, position(slot)])
+            row["velocity_rmse_mps"] = rms(own[1:, velocity(slot)])
+            row["norm_full_mean"] = float(np.linalg.norm(own[1:], axis=1).mean())
+            row["norm_full_final"] = float(np.linalg.norm(own[-1]))
+            row["anees"] = float(result.nees_full[1:, slot].mean())
+        agents.append(row)
+    return {"ticks": recording.ticks + 1, "agents": agents, "late_records_dropped": int(result.dropped.sum())}
+
+
+def _print(recording: Recording, figures: dict[str, Any]) -> None:
+    from fleetloc.output import print_table
+
+    known = recording.truth is not None
+    columns = ["agent", "ticks ok", "other"]
+    if known:
+        columns += ["position RMSE m", "velocity RMSE m/s", "fleet error", "at the end", "ANEES"]
+    rows = []
+    for agent in figures["agents"]:
+        ok = agent["status"]["ok"]
+        row = [str(agent["id"]), str(ok), str(figures["ticks"] - ok)]
+        if known:
+            keys = ("position_rmse_m", "velocity_rmse_mps", "norm_full_mean", "norm_full_final", "anees")
+            row += [f"{agent[key]:.4f}" for key in keys]
+        rows.append(row)
+    print_table(columns, rows)

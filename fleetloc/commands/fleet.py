@@ -1,0 +1,109 @@
+"""``fleetloc fleet``: a whole fleet on this machine, live or in virtual time, and its report."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from fleetloc.errors import INTERRUPTED
+from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides, Profiles
+
+if TYPE_CHECKING:
+    from agent.config.tables import FleetConfig
+    from fleetloc.run.fleet_run import Outcome
+
+
+def register(app: typer.Typer) -> None:
+    """Add the command to the command line."""
+    app.command("fleet")(fleet)
+
+
+def fleet(
+    config: FleetFile,
+    duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
+    seed: Annotated[int | None, typer.Option("--seed", help="Of the world and of injected faults.")] = None,
+    loss: Loss = None,
+    delay_s: Delay = None,
+    out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
+    json_file: FiguresFile = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
+    lockstep: Annotated[
+        bool, typer.Option("--lockstep", help="Virtual time in one process: fast, and the same at every run.")
+    ] = False,
+) -> None:
+    """Fly a simulated fleet with one daemon per drone, show it live, and write a report.
+
+    Ends after the duration or on Ctrl-C; the report is written in either case.
+    """
+    from fleetloc.report.fleet_report import write_report
+    from fleetloc.run import run_files
+    from fleetloc.warmup import announce, warm_up_everything
+
+    options: dict[str, float | int | None] = {
+        "sim.duration_s": duration_s,
+        "sim.seed": seed,
+        "transport.seed": seed,
+        "transport.loss": loss,
+        "transport.delay_s": delay_s,
+    }
+    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
+    fleet_config = _prepared(config, profiles or [], [*settings, *(overrides or ())], out, live=not lockstep)
+    folder = Path(str(fleet_config.record.directory))
+    announce()
+    warm_up_everything()
+    if lockstep:
+        from fleetloc.run.lockstep_run import fly_in_lockstep
+
+        began_s = time.monotonic()
+        outcome = fly_in_lockstep(fleet_config, folder)
+        outcome.wall_s = time.monotonic() - began_s
+    else:
+        outcome = _fly(fleet_config, folder)
+        if outcome.wall_s == 0.0:  # interrupted before anything flew
+            raise typer.Exit(INTERRUPTED)
+    write_report(fleet_config, folder, outcome, json_file, "lockstep" if lockstep else "live")
+    typer.echo(f"report: {folder / run_files.REPORT_HTML}")
+
+
+def _prepared(
+    config: Path, profiles: list[Path], settings: list[str], out: Path | None, *, live: bool
+) -> FleetConfig:
+    """The effective configuration, also written into the run's folder for all its processes.
+
+    Checks before anything starts: the scenario, and for a live run what the security profile promises.
+    """
+    from agent.config.reading import dump, load_config
+    from agent.radio.security import require
+    from agent.sensing.clock import require_epoch
+    from fleetloc.run import run_files
+    from sim_bridge.world.scenario_config import scenario_from_config
+
+    fleet = load_config(config, settings, profiles)
+    scenario_from_config(fleet)
+    folder = (out or Path("out") / fleet.fleet.name).resolve()
+    run_files.refuse_inputs(folder, (config, *profiles))
+    if live:
+        require_epoch(fleet.fleet, str(config), unix_s=time.time())
+        for agent_id in fleet.ids:
+            require(fleet, agent_id, config.parent, unix_s=time.time())
+    fleet = run_files.in_folder(fleet, config.parent, folder)
+    run_files.clear(folder)
+    (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
+    return fleet
+
+
+def _fly(config: FleetConfig, folder: Path) -> Outcome:
+    import asyncio
+
+    from rich.console import Console
+
+    from fleetloc.run.fleet_run import FleetRun
+
+    async def fly() -> Outcome:
+        return await FleetRun(config, folder, Console(stderr=True)).fly()
+
+    return asyncio.run(fly())

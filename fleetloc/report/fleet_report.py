@@ -1,0 +1,230 @@
+"""The figures of a run: ``report.json``, the table on the terminal and the page with the plots."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from agent.config.tables import FleetConfig
+from estimators.integrity.consistency import rms
+from fleetloc.output import print_table, write_json
+from fleetloc.report.fleet_results import Floats, Results, Track, load_results
+from fleetloc.report.report_html import page
+from fleetloc.run import run_files
+from fleetloc.run.fleet_run import Outcome
+from transport.messages.report_body import Diagnostics
+
+SETTLED_S = 10.0
+"""Errors are also given from here on, when what an agent knew at its start is forgotten."""
+SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "range": "uwb"}
+"""Names of the core's counters, and of the counters of what was left out before."""
+
+
+def write_report(
+    config: FleetConfig, directory: Path, outcome: Outcome, json_file: Path | None, mode: str
+) -> dict[str, Any]:
+    """Read the run's files, write ``report.json`` and ``report.html``, print the figures; returns them."""
+    results = load_results(config, directory)
+    figures = report_figures(config, results, directory, outcome, mode)
+    for path in (directory / run_files.REPORT_JSON, *([json_file] if json_file else [])):
+        write_json(path, figures)
+    (directory / run_files.REPORT_HTML).write_text(page(config, results, figures), encoding="utf-8")
+    _print(figures)
+    return figures
+
+
+def report_figures(
+    config: FleetConfig, results: Results, directory: Path, outcome: Outcome, mode: str
+) -> dict[str, Any]:
+    """The content of ``report.json``; units are in the names, what is not known is null."""
+    agents = []
+    for track in results.tracks:
+        lives = _lives(directory, track.agent_id, outcome.lives.get(track.agent_id, []))
+        use = outcome.use.get(track.agent_id)
+        gauges = lives[-1].gauges if lives else {}
+        agents.append(
+            _of_track(track)
+            | {
+                "cpu_fraction": (use.cpu_fraction if use else None) or gauges.get("cpu_fraction"),
+                "rss_mb": (use.rss_mb if use else None) or gauges.get("rss_mb"),
+            }
+            | _of_counters(lives)
+        )
+    return {
+        "config": msgspec.to_builtins(config),
+        "mode": mode,
+        "seed": config.sim.seed,
+        "duration_s": results.duration_s,
+        "truth": "simulator",
+        "agents": agents,
+        "fleet": _of_fleet(results, agents)
+        | {
+            "wall_s": outcome.wall_s,
+            "times_real_time": results.duration_s / outcome.wall_s if outcome.wall_s > 0.0 else None,
+            "interrupted": outcome.interrupted,
+            "deaths": [{"name": d.name, "at_s": d.at_s, "why": d.why} for d in outcome.deaths],
+            "simulator": _simulator(directory),
+        },
+    }
+
+
+def _of_track(track: Track) -> dict[str, Any]:
+    known, settled = track.known, track.known & (track.time_s >= SETTLED_S)
+    return {
+        "id": track.agent_id,
+        "ticks_expected": track.ticks_expected,
+        "ticks_on_time": int(np.count_nonzero(track.on_time)),
+        "ticks_without_estimate": int(np.count_nonzero(~known)),
+        "daemons": track.records,
+        "position_rmse_m": _rms(track.own_error_m[known]),
+        "position_rmse_after_10s_m": _rms(track.own_error_m[settled]),
+        "norm_full_rms": _rms(track.full_error[known]),
+        "norm_full_rms_after_10s": _rms(track.full_error[settled]),
+        "anees": _mean(track.nees[known]),
+        "anees_after_10s": _mean(track.nees[settled]),
+        "tick_time_p50_s": _percentile(track.tick_time_s, 50),
+        "tick_time_p99_s": _percentile(track.tick_time_s, 99),
+        "publish_latency_p50_s": _percentile(track.latency_s, 50),
+        "publish_latency_p99_s": _percentile(track.latency_s, 99),
+    }
+
+
+def _of_counters(lives: list[Diagnostics]) -> dict[str, Any]:
+    """What all daemons of one agent counted together."""
+    total: Counter[str] = Counter()
+    for life in lives:
+        total.update(life.counters)
+    sensors = counted_sensors(total)
+    if lives:  # of the last daemon: the latency that it assumes, or has estimated on line
+        gauges = lives[-1].gauges
+        sensors["gps"] |= {
+            "latency_s": gauges.get("gps_latency_s"),
+            "latency_sigma_s": gauges.get("gps_latency_sigma_s"),
+        }
+    return {"packets": counted_packets(total), "sensors": sensors}
+
+
+def counted_packets(total: Counter[str]) -> dict[str, Any]:
+    """An agent's packets, out of its counters."""
+    return {
+        "sent": total["packets sent"],
+        "received": total["packets received"],
+        "lost": total["packets lost"],
+        "injected_losses": total["injected losses"],
+        "late": total["measurements: late"] + total["information: late"],
+        "rejected": {name.removeprefix("rejected "): n for name, n in total.items() if name.startswith("rejected ")},
+    }
+
+
+def counted_sensors(total: Counter[str]) -> dict[str, dict[str, Any]]:
+    """An agent's sensors, out of its counters."""
+    return {name: _of_sensor(name, left_out, total) for name, left_out in SENSORS.items()}
+
+
+def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:
+    """Samples used and not."""
+    wrong_time = total[f"{name}: wrong time"]
+    skipped = sum(n for key, n in total.items() if key.startswith(f"skipped {left_out}"))
+    return {
+        "used": total[f"{name}: samples"] - wrong_time,
+        "skipped": skipped + wrong_time,
+        "latency_s": None,
+        "latency_sigma_s": None,
+    }
+
+
+def _of_fleet(results: Results, agents: list[dict[str, Any]]) -> dict[str, Any]:
+    expected, on_time = (sum(agent[key] for agent in agents) for key in ("ticks_expected", "ticks_on_time"))
+    packets = {key: sum(agent["packets"][key] for agent in agents) for key in ("sent", "received", "lost", "late")}
+    rejected: Counter[str] = Counter()
+    for agent in agents:
+        rejected.update(agent["packets"]["rejected"])
+    times = np.concatenate([track.tick_time_s for track in results.tracks])
+    return {
+        "ticks_expected": expected,
+        "ticks_on_time": on_time,
+        "ticks_on_time_fraction": on_time / expected if expected else None,
+        **{key: _root_mean_square(agent[key] for agent in agents) for key in
+           ("position_rmse_m", "position_rmse_after_10s_m", "norm_full_rms", "norm_full_rms_after_10s")},
+        **{key: _mean_known(agent[key] for agent in agents) for key in ("anees", "anees_after_10s")},
+        "tick_time_p50_s": _percentile(times, 50),
+        "tick_time_p99_s": _percentile(times, 99),
+        "cpu_fraction": _sum_known(agent["cpu_fraction"] for agent in agents),
+        "rss_mb": _sum_known(agent["rss_mb"] for agent in agents),
+        "packets": {**packets, "rejected": dict(rejected)},
+    }  # fmt: skip
+
+
+def _lives(directory: Path, agent_id: int, heard: list[Diagnostics]) -> list[Diagnostics]:
+    """The last word of every daemon; the last one's own summary is newer than what was heard of it."""
+    summary = run_files.record_path(directory, agent_id).with_suffix(run_files.SUMMARY_SUFFIX)
+    if not summary.exists():
+        return heard
+    content = msgspec.json.decode(summary.read_bytes())
+    final = Diagnostics(agent_id, content["state"], (), content["counters"], content["gauges"])
+    return [*heard[:-1], final]
+
+
+def _simulator(directory: Path) -> dict[str, Any] | None:
+    path = directory / run_files.SIMULATOR_JSON
+    content: dict[str, Any] | None = msgspec.json.decode(path.read_bytes()) if path.exists() else None
+    return content
+
+
+def _rms(errors: Floats) -> float | None:
+    return rms(errors) if len(errors) else None
+
+
+def _mean(values: Floats) -> float | None:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if len(finite) else None
+
+
+def _percentile(values: Floats, percent: float) -> float | None:
+    """``None`` too where nothing was measured: virtual time has no computing time."""
+    return float(np.percentile(values, percent)) if len(values) and values.any() else None
+
+
+def _root_mean_square(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.sqrt(np.mean(np.square(known)))) if known else None
+
+
+def _mean_known(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
+
+
+def _sum_known(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.sum(known)) if known else None
+
+
+def _shown(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
+    """A figure for people."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"
+
+
+def _print(figures: dict[str, Any]) -> None:
+    columns = ["agent", "ticks on time", "RMSE m", "after 10 s", "fleet error", "ANEES"]
+    columns += ["tick p50/p99 ms", "CPU %", "MB"]
+    rows = [
+        [
+            str(row.get("id", "fleet")),
+            f"{row['ticks_on_time']}/{row['ticks_expected']}",
+            _shown(row["position_rmse_m"]),
+            _shown(row["position_rmse_after_10s_m"]),
+            _shown(row["norm_full_rms"]),
+            _shown(row["anees"], 2),
+            f"{_shown(row['tick_time_p50_s'], 1, 1e3)}/{_shown(row['tick_time_p99_s'], 1, 1e3)}",
+            _shown(row["cpu_fraction"], 1, 100.0),
+            _shown(row["rss_mb"], 0),
+        ]
+        for row in (*figures["agents"], figures["fleet"])
+    ]
+    print_table(columns, rows)

@@ -1,0 +1,45 @@
+"""The report of a replay: ``report.json``, ``report.html`` and the tables on the terminal."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Any
+
+import typer
+
+from fleetloc.output import print_table, write_json
+from fleetloc.report.replay_figures import load_results, report_figures
+from fleetloc.report.replay_page import drawn_sections, page
+from fleetloc.report.replay_tables import cautions, error_table, log_table
+from fleetloc.run import run_files
+from fleetloc.run.replay_run import Replayed
+from fleetloc.run.replay_setup import Prepared
+
+
+def write_report(
+    prepared: Prepared, replayed: Replayed, directory: Path, json_file: Path | None, began_s: float
+) -> dict[str, Any]:
+    """Compare, write ``report.html`` and ``report.json``, print the figures; returns them.
+
+    ``began_s`` is the monotonic time at which the command began: it is the whole of it that is timed.
+    """
+    results = load_results(prepared, directory)
+    figures = report_figures(prepared, replayed, results)
+    sections = drawn_sections(prepared, replayed, results, figures)
+    wall_s = time.monotonic() - began_s
+    figures["fleet"] |= {"wall_s": wall_s, "times_real_time": figures["duration_s"] / wall_s}
+    html = page(prepared, sections, figures)
+    (directory / run_files.REPORT_HTML).write_text(html, encoding="utf-8")
+    for path in (directory / run_files.REPORT_JSON, *([json_file] if json_file else [])):
+        write_json(path, figures)
+    _print(figures)
+    return figures
+
+
+def _print(figures: dict[str, Any]) -> None:
+    title = "SYNTHETIC RANGES, made of the truth" if figures["synthetic_ranges"] else None
+    print_table(*log_table(figures), title="logs: samples used, content skipped")
+    print_table(*error_table(figures), title=title)
+    for sentence in cautions(figures):
+        typer.echo(f"note: {sentence}")

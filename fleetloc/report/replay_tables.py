@@ -1,0 +1,82 @@
+"""The tables of a replay's report, for the terminal and the page."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from fleetloc.report.replay_figures import ALL, SETTLED
+
+MOSTLY = 0.9
+"""Share of the estimates with a truth below which a reader is told."""
+
+
+def log_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows: what was used and skipped of each vehicle's log."""
+    columns = ["log", "system", "agent", "s", "imu", "attitude", "gps", "ranges", "skipped", "why"]
+    rows = []
+    logs = {log["file"]: log for log in figures["logs"]}
+    for agent in figures["agents"]:
+        log = logs[agent["log"]]
+        used = log["used"].get(str(agent["system_id"]), {})
+        counted = {k.removeprefix("skipped "): n for k, n in agent["counters"].items() if k.startswith("skipped ")}
+        skipped = log["skipped"] | {reason: n for reason, n in counted.items() if n}
+        why = sorted(skipped.items(), key=lambda item: -item[1])[:3]
+        rows.append(
+            [
+                agent["log"],
+                f"{agent['system_id']} {agent['autopilot']}",
+                str(agent["id"]),
+                f"{log['duration_s']:.0f}",
+                *(str(used.get(kind, 0)) for kind in ("imu", "attitude", "gps")),
+                str(agent["sensors"]["range"]["used"]),
+                str(sum(skipped.values())),
+                "; ".join(f"{n} {reason}" for reason, n in why) or "-",
+            ]
+        )
+    return columns, rows
+
+
+def error_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
+    """Columns and rows: errors in m by agent and phase."""
+    columns = ["agent, phase", "RMSE", "horiz.", "median", "95 %", "ANEES", "own ANEES", "autopilot horiz.",
+               "GPS as received", "to autopilot"]  # fmt: skip
+    rows = []
+    for agent in figures["agents"]:
+        for name, phase in agent["phases"].items():
+            if name == ALL and phase["ticks_with_truth"] == agent["phases"][SETTLED]["ticks_with_truth"] != 0:
+                continue
+            rows.append(
+                [
+                    f"{agent['id']} {name}",
+                    *(
+                        shown(phase[key])
+                        for key in ("position_rmse_m", "horizontal_rmse_m", "position_median_m", "position_p95_m")
+                    ),
+                    shown(phase["anees"], 2),
+                    shown(phase["anees_own"], 2),
+                    shown(phase["autopilot_horizontal_rmse_m"]),
+                    shown(phase["gps_as_received_horizontal_rmse_m"]),
+                    shown(phase["to_autopilot_horizontal_rms_m"]),
+                ]
+            )
+    return columns, rows
+
+
+def cautions(figures: dict[str, Any]) -> list[str]:
+    """What a reader of the figures must know of them."""
+    sentences = []
+    for agent in figures["agents"]:
+        if agent["first_estimate_s"] is None:
+            sentences.append(f"drone {agent['id']} ({agent['log']}) never had an estimate: no fixes, or none in time")
+        estimated = agent["ticks_expected"] - agent["ticks_without_estimate"]
+        if 0 < agent["ticks_with_truth"] < MOSTLY * estimated:
+            known = f"{agent['ticks_with_truth']} of its {estimated} estimates"
+            sentences.append(f"errors of drone {agent['id']} are of {known}: there is no truth for the others")
+    if figures["fleet"]["silences_left_out"]:
+        sentences.append(f"{figures['fleet']['silences_left_out']} long silence(s) of the logs were left out")
+    return sentences
+
+
+def shown(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
+    """A figure for people."""
+    return "-" if value is None else f"{factor * value:.{digits}f}"

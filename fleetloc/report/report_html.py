@@ -1,0 +1,103 @@
+"""A run's page: one file, no network, readable in any browser and on paper."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from html import escape
+from typing import Any
+
+from agent.config.tables import FleetConfig
+from fleetloc.report import report_plots
+from fleetloc.report.fleet_results import Results
+
+CSS = """
+body { font: 15px/1.45 system-ui, sans-serif; color: #1b1b1b; background: #fff; max-width: 1100px;
+       margin: 2em auto; padding: 0 1em; }
+h1 { font-size: 1.5em; margin-bottom: 0.2em; } h2 { font-size: 1.15em; margin: 1.8em 0 0.2em; }
+p.note { color: #555; margin: 0.2em 0 0.6em; } svg { width: 100%; height: auto; }
+table { border-collapse: collapse; font-size: 0.92em; margin: 0.6em 0; }
+th, td { padding: 0.25em 0.8em; text-align: right; border-bottom: 1px solid #ddd; } th { color: #444; }
+th:first-child, td:first-child { text-align: left; } tr.total td { font-weight: 600; border-top: 1px solid #888; }
+.warning { background: #fff3d6; padding: 0.5em 0.8em; border-left: 4px solid #e69f00; }
+"""
+
+COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
+    ("ticks on time", lambda row: f"{row['ticks_on_time']} of {row['ticks_expected']}"),
+    ("position RMSE m", lambda row: _number(row["position_rmse_m"], 3)),
+    ("after 10 s", lambda row: _number(row["position_rmse_after_10s_m"], 3)),
+    ("fleet error rms", lambda row: _number(row["norm_full_rms"], 3)),
+    ("ANEES", lambda row: _number(row["anees"], 2)),
+    ("tick p50 / p99 ms", lambda row: f"{_ms(row['tick_time_p50_s'])} / {_ms(row['tick_time_p99_s'])}"),
+    ("CPU %", lambda row: _number(row["cpu_fraction"], 1, 100)),
+    ("memory MB", lambda row: _number(row["rss_mb"], 0)),
+)
+
+
+def page(config: FleetConfig, results: Results, figures: dict[str, Any]) -> str:
+    """The whole page of a run; ``figures`` is the content of ``report.json``."""
+    name, fleet = escape(config.fleet.name), figures["fleet"]
+    sections = [
+        ("Where they were", "Truth pale and wide, each drone's own estimate thin on top; a dot marks the start.",
+         report_plots.trajectories(results)),
+        ("Position error and its 3-sigma band",
+         "Each drone's error of its own position; the shaded band is what it claims. Grey: its GPS is out.",
+         report_plots.errors(config, results)),
+        ("Consistency", "Squared error of the whole fleet state in units of its covariance: near 1 is right, above "
+         "the band the estimator is overconfident, below it is cautious. Samples of one run are correlated.",
+         report_plots.consistency(results)),
+        ("Timing", "A tick's estimate has to be out within one period of the tick's end.",
+         report_plots.timing(results)),
+        ("Packets", "On the radio between drones. Lost: missing in the sequence numbers; injected losses included.",
+         report_plots.packets(figures["agents"])),
+    ]  # fmt: skip
+    body = "\n".join(
+        f'<h2>{title}</h2>\n<p class="note">{escape(note)}</p>\n{svg}' for title, note, svg in sections
+    )
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
+        f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
+        f'<p class="note">{escape(_summary(config, figures))}</p>\n{_warnings(fleet)}{_table(figures)}\n{body}\n'
+        "</body>\n</html>\n"
+    )
+
+
+def _summary(config: FleetConfig, figures: dict[str, Any]) -> str:
+    how = "live, a process per drone"
+    if figures["mode"] == "lockstep":
+        how = f"in virtual time, {figures['fleet']['times_real_time']:.1f} times faster than real time"
+    return (
+        f"{len(config.agents)} drones, {figures['duration_s']:.0f} s {how}; {config.estimator.kind}, window "
+        f"{config.estimator.window}, {config.estimator.rounds} round(s), {1 / config.fleet.period_s:g} Hz; world "
+        f"'{config.sim.profile}', seed {figures['seed']}; loss {config.transport.loss:g}, delay "
+        f"{config.transport.delay_s:g} s"
+    )
+
+
+def _warnings(fleet: dict[str, Any]) -> str:
+    sentences = [f"{death['name']} at {death['at_s']:.1f} s: {death['why']}" for death in fleet["deaths"]]
+    if fleet["interrupted"]:
+        sentences.append("the run was interrupted before its end")
+    behind_s = (fleet["simulator"] or {}).get("max_behind_s", 0.0)
+    if behind_s > 0.1:
+        sentences.append(f"the simulator was up to {behind_s:.2f} s behind the clock: the machine was overloaded")
+    return "".join(f'<p class="warning">{escape(sentence)}</p>\n' for sentence in sentences)
+
+
+def _table(figures: dict[str, Any]) -> str:
+    head = "".join(f"<th>{escape(title)}</th>" for title, _ in COLUMNS)
+    rows = [_row(f"drone {agent['id']}", agent) for agent in figures["agents"]]
+    rows.append(_row("fleet", figures["fleet"], ' class="total"'))
+    return f"<table>\n<tr><th></th>{head}</tr>\n{''.join(rows)}</table>"
+
+
+def _row(name: str, row: dict[str, Any], mark: str = "") -> str:
+    cells = "".join(f"<td>{escape(show(row))}</td>" for _, show in COLUMNS)
+    return f"<tr{mark}><td>{escape(name)}</td>{cells}</tr>\n"
+
+
+def _number(value: float | None, digits: int, factor: float = 1.0) -> str:
+    return "-" if value is None else f"{factor * value:.{digits}f}"
+
+
+def _ms(value_s: float | None) -> str:
+    return _number(value_s, 1, 1e3)

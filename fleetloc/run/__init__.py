@@ -1,0 +1,1 @@
+"""Runs: processes, their files, live tables."""

@@ -1,0 +1,172 @@
+"""A replay with its files: estimates and references go to disk as they come.
+
+Beside those of every run (`fleetloc.run.run_files`) and what is made of them for other tools
+(`fleetloc.report.replay_exports`) the folder holds
+
+======================  ======================================================================================
+``truth_001.track``     what they are compared with (`sim_bridge.replay.tracks`); likewise ``autopilot``, ``gps``
+                        and ``gps_received`` (the same fixes at the times of their arrival)
+======================  ======================================================================================
+"""
+
+from __future__ import annotations
+
+import gc
+import re
+import sys
+import time
+from collections.abc import Iterable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from agent.config.tables import FleetConfig
+from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.outputs import EstimateReady
+from agent.sensing.samples import AutopilotEstimate, GpsSample
+from estimators.factory import make_estimator
+from fleetloc.output import progress_bar
+from fleetloc.report.replay_exports import MCAP
+from fleetloc.run import run_files
+from fleetloc.run.replay_setup import Prepared
+from sim_bridge.replay.engine import Replay, ReplayCounts
+from sim_bridge.replay.feed import Feed
+from sim_bridge.replay.logs.events import TruthSample
+from sim_bridge.replay.reading import read_beside
+from sim_bridge.replay.statistics import Thinned
+from sim_bridge.replay.tracks import TrackWriter
+from sim_bridge.virtual.lockstep_members import ObjectMember
+
+KINDS = ("truth", "autopilot", "gps", "gps_received")
+"""References, each with a track per agent."""
+UNKNOWN_HEIGHT = float("nan")
+LATENCY_EVERY_S = 1.0
+RARE_COLLECTIONS = (100_000, 50, 100)
+"""Thresholds of the collector while samples stream through: they leave no cycles, and looking for some is a tenth."""
+_OF_A_REPLAY = re.compile(rf"agent_[0-9]{{3}}\.csv|({'|'.join(KINDS)})_[0-9]{{3}}\.track|{re.escape(MCAP)}")
+
+
+def refuse_inputs(directory: Path, inputs: Iterable[Path | str]) -> None:
+    """Refuse a folder in which `clear` would remove what the replay is to read; raises `InputError`."""
+    run_files.refuse_inputs(directory, inputs, also=_OF_A_REPLAY)
+
+
+def clear(directory: Path) -> None:
+    """Make the folder, and remove what an earlier run left in it; raises `OSError` if the folder refuses."""
+    run_files.clear(directory)
+    for path in directory.iterdir():
+        if _OF_A_REPLAY.fullmatch(path.name):
+            path.unlink()
+
+
+def track_path(directory: Path, kind: str, agent_id: int) -> Path:
+    """The track of one kind of reference of one agent."""
+    return directory / f"{kind}_{agent_id:03d}.track"
+
+
+@dataclass(slots=True)
+class Replayed:
+    """What a run leaves besides its files."""
+
+    counts: ReplayCounts
+    wall_s: float
+    cpu_s: float
+    latency: dict[int, Thinned] = field(default_factory=dict)
+    """By agent: fleet time, latency of its GPS in s, 1-sigma; empty where it is not estimated."""
+
+
+class ReferenceTracks:
+    """What estimates will be compared with, on disk."""
+
+    def __init__(self, directory: Path, agents: Sequence[int]) -> None:
+        """Make the files anew; raises `OSError`."""
+        self._tracks = {
+            (kind, agent_id): TrackWriter(track_path(directory, kind, agent_id))
+            for kind in KINDS
+            for agent_id in agents
+        }
+
+    def on_reference(
+        self, agent_id: int, sample: TruthSample | AutopilotEstimate | GpsSample, arrival_s: float
+    ) -> None:
+        """Write one; times are fleet time."""
+        if isinstance(sample, TruthSample):
+            north, east, down = sample.position_m
+            place = (north, east, down if sample.has_height else UNKNOWN_HEIGHT)
+            self._tracks["truth", agent_id].write(sample.t_s, place, sample.velocity_mps)
+        elif isinstance(sample, AutopilotEstimate):
+            self._tracks["autopilot", agent_id].write(sample.t_s, sample.position_m, sample.velocity_mps)
+        else:
+            self._tracks["gps", agent_id].write(sample.t_s, sample.position_m, None)
+            self._tracks["gps_received", agent_id].write(arrival_s, sample.position_m, None)
+
+    def close(self) -> None:
+        """Close all files, also where one of them refuses; may be called again."""
+        with ExitStack() as stack:
+            for track in self._tracks.values():
+                stack.callback(track.close)
+
+
+class Results:
+    """Writes the agents' estimates down, and notes what the cores know of their sensors' latency."""
+
+    def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
+        self.members: dict[int, ObjectMember] = {}
+        self.latency: dict[int, Thinned] = {}
+        self._noted_s: dict[int, float] = {}
+        self._recorders: dict[int, EstimateRecorder] = {}
+        fleet = config.fleet
+        for agent_id in agents:
+            header = RecordHeader(
+                fleet=fleet.name,
+                agent=agent_id,
+                agents=config.ids,
+                period_s=fleet.period_s,
+                epoch_unix_s=fleet.epoch_unix_s,
+            )
+            record = run_files.record_path(directory, agent_id)
+            self._recorders[agent_id] = EstimateRecorder(record, header, sys.maxsize)
+
+    def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
+        """Write an estimate, and note the latency now and then."""
+        self._recorders[agent_id].write(ready, ready.ready_s, 0.0)
+        if ready.ready_s < self._noted_s.get(agent_id, 0.0) + LATENCY_EVERY_S:
+            return
+        known = self.members[agent_id].core.gps_latency
+        if known.latency_s is not None and known.sigma_s is not None:
+            self._noted_s[agent_id] = ready.ready_s
+            row = np.array((ready.ready_s, known.latency_s, known.sigma_s))
+            self.latency.setdefault(agent_id, Thinned()).add(row)
+
+    def close(self) -> None:
+        """Close the records."""
+        for recorder in self._recorders.values():
+            recorder.close()
+
+
+def run_replay(prepared: Prepared, directory: Path) -> Replayed:
+    """Replay into a folder."""
+    config, inputs = prepared.config, prepared.inputs
+    agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
+    feed = Feed(inputs, ReferenceTracks(directory, agents))
+    results = Results(directory, config, agents)
+    replay = Replay(config, feed, make_estimator, results.on_estimate)
+    results.members = replay.members
+    gc.collect()
+    gc.freeze()  # full collections over all modules would take a tenth of the time
+    usual = gc.get_threshold()
+    gc.set_threshold(*RARE_COLLECTIONS)
+    began_s, cpu_s = time.monotonic(), time.process_time()
+    try:
+        with (
+            read_beside(feed) as arrivals,
+            progress_bar("seconds of the logs", int(inputs.to_s - inputs.from_s)) as advance,
+        ):
+            counts = replay.run(lambda _now_s: advance(), arrivals)
+    finally:
+        results.close()
+        gc.set_threshold(*usual)
+        gc.unfreeze()
+    return Replayed(counts, time.monotonic() - began_s, time.process_time() - cpu_s, results.latency)

@@ -1,0 +1,1 @@
+"""Fake autopilots, as strict as the real ones."""

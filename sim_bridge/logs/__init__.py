@@ -1,8 +1,0 @@
-"""Flight logs as streams of samples: MAVLink telemetry logs, ArduPilot dataflash logs, PX4 ULog.
-
-`open_log` is the door; `sim_bridge.logs.events` says what comes out.
-"""
-
-from sim_bridge.logs.opening import open_log
-
-__all__ = ["open_log"]

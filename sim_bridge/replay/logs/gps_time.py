@@ -1,0 +1,81 @@
+"""GPS and UTC stamps in a log to the Unix time of log time 0."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from sim_bridge.replay.logs.events import UnixZero
+
+GPS_EPOCH_UNIX_S = 315_964_800
+WEEK_S = 604_800
+LEAP_SECONDS = 18
+"""GPS minus UTC since 2017; earlier leap seconds would put an older log at most a few seconds off."""
+RECEIVER_LATENCY_SIGMA_S = 0.1
+"""Fixes are logged 0.05 to 0.25 s after their instant, which the fit cannot see."""
+FEWEST = 2
+MAX_DRIFT = 0.05
+DRIFT_SPAN_S = 30.0
+"""Over less the drift is not told from the receiver's jitter, and taken as none."""
+KEPT = 2048
+
+
+def unix_of_week(week: int, of_week_ms: int) -> float:
+    """Unix time of a GPS week and the milliseconds of it."""
+    return GPS_EPOCH_UNIX_S + week * WEEK_S + of_week_ms * 1e-3 - LEAP_SECONDS
+
+
+@dataclass(slots=True)
+class GpsTimeFit:
+    """Pairs of log and Unix time to a line; memory is bounded by keeping every second pair when full."""
+
+    pairs: list[tuple[float, float]] = field(default_factory=list)
+    stride: int = 1
+    seen: int = 0
+
+    def add(self, t_s: float, unix_s: float) -> None:
+        """Take in that it was ``unix_s`` at log time ``t_s``; what is not finite is left out."""
+        if not (math.isfinite(t_s) and math.isfinite(unix_s)):
+            return
+        self.seen += 1
+        if self.seen % self.stride == 0:
+            self.pairs.append((t_s, unix_s))
+            if len(self.pairs) >= KEPT:
+                self.pairs = self.pairs[::2]
+                self.stride *= 2
+
+    def unix_zero(self) -> UnixZero:
+        """By receiver time: the median line, which single wrong stamps do not bend."""
+        line = fitted(self.pairs)
+        if line is None:
+            return UnixZero(0.0, math.inf, "unknown")
+        offset_s, drift, spread_s = line
+        return UnixZero(offset_s, math.hypot(spread_s, RECEIVER_LATENCY_SIGMA_S), "gps", drift)
+
+
+def fitted(pairs: list[tuple[float, float]]) -> tuple[float, float, float] | None:
+    """Offset at log time 0, drift, and robust spread of Unix minus log time; ``None`` of too few pairs."""
+    if len(pairs) < FEWEST:
+        return None
+    t_s, unix_s = np.array(pairs).T
+    centre_s = float(np.median(t_s))
+    difference_s = unix_s - t_s
+    level_s = float(np.median(difference_s))
+    drift = _median_slope(t_s, difference_s - level_s)
+    residual_s = difference_s - level_s - drift * (t_s - centre_s)
+    shift_s = float(np.median(residual_s))
+    spread_s = 1.4826 * float(np.median(np.abs(residual_s - shift_s)))
+    return level_s + shift_s - drift * centre_s, drift, spread_s
+
+
+def _median_slope(x: np.ndarray, y: np.ndarray) -> float:
+    """Median of the slopes between points half the data apart (after Theil and Sen)."""
+    half = len(x) // 2
+    run = x[half:] - x[: len(x) - half]
+    usable = run > 0
+    if not usable.any() or np.ptp(x) < DRIFT_SPAN_S:
+        return 0.0
+    slope = float(np.median((y[half:] - y[: len(y) - half])[usable] / run[usable]))
+    return min(max(slope, -MAX_DRIFT), MAX_DRIFT)

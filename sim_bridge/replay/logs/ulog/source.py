@@ -1,0 +1,172 @@
+"""PX4 logs (``.ulg``): log time is the autopilot's boot time. Needs the extra ``[ulog]``."""
+
+from __future__ import annotations
+
+import heapq
+import math
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from agent.config.tables import SensorsTable
+from agent.sensing.frames import FleetFrame
+from sim_bridge.replay.logs.events import (
+    Format,
+    GeodeticPoint,
+    LogCounts,
+    LogError,
+    LogEvent,
+    LogSurvey,
+    SystemSurvey,
+    UnixZero,
+)
+from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted
+from sim_bridge.replay.logs.surveyed import SurveyedLog
+from sim_bridge.replay.logs.ulog.samples import (
+    GPS_TOPICS,
+    WANTED,
+    Timed,
+    attitude_samples,
+    degrees,
+    estimate_samples,
+    gps_samples,
+    imu_samples,
+    truth_samples,
+)
+from sim_bridge.replay.logs.ulog.tables import MAGIC, Table, Tables, load_tables
+
+__all__ = ["MAGIC", "UlogSource"]
+
+UNIX_US = 10**15
+TIMESYNC_SIGMA_S = 0.01
+_FIX_3D = 3
+
+
+class UlogSource(SurveyedLog):
+    """A `LogSource` over a PX4 log, plain or gzip. Its tables stay in memory between survey and events."""
+
+    format: Format = "ulog"
+
+    def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
+        super().__init__(path, frame, sensors)
+        self._loaded: Tables | None = None
+        self._damage: Counter[str] = Counter()
+
+    def events(self) -> Iterator[LogEvent]:
+        """The samples of all topics, merged by the time of their publication."""
+        (system,) = self.survey().systems.values()
+        tables, frame = self._tables(), self.frame
+        counts = self.counts = LogCounts(skipped=self._damage.copy())
+        skipped = counts.skipped
+        streams: list[Iterator[Timed]] = []
+        for name, table in tables.topics.items():
+            if name == "sensor_combined":
+                streams.append(imu_samples(table, self._sensors, skipped))
+            elif name == "vehicle_attitude":
+                streams.append(attitude_samples(table, skipped))
+            elif name == "vehicle_local_position":
+                streams.append(estimate_samples(table, frame, skipped))
+            elif name == "vehicle_local_position_groundtruth":
+                attitude = tables.topics.get("vehicle_attitude_groundtruth")
+                streams.append(truth_samples(table, attitude, frame, skipped))
+        gps = _gps_table(tables)
+        if gps is not None:
+            streams.append(gps_samples(gps, frame, self._sensors, skipped))
+        for arrival_s, sample in heapq.merge(*streams, key=_arrival):
+            event = LogEvent(arrival_s, system.system_id, sample)
+            counts.count(event)
+            yield event
+
+    def _tables(self) -> Tables:
+        if self._loaded is None:
+            self._damage.clear()
+            self._loaded = load_tables(self.path, WANTED, self._damage)
+        return self._loaded
+
+    def _made_survey(self) -> LogSurvey:
+        tables = self._tables()
+        if not tables.topics:
+            raise LogError(self.path, "topics of sensors or estimates", "none that could be read")
+        first_s = min(int(table.timestamp_us[0]) for table in tables.topics.values()) * 1e-6
+        last_s = max(int(table.timestamp_us[-1]) for table in tables.topics.values()) * 1e-6
+        system_id = tables.parameters.get("MAV_SYS_ID", 1.0)
+        system_id = system_id if 1.0 <= system_id <= 255.0 else 1.0  # false for NaN as well
+        local = tables.topics.get("vehicle_local_position")
+        origin = None if local is None else _reference(local)
+        estimate_frame: Literal["fleet", "own", "none"] = "none" if local is None else "own"
+        system = SystemSurvey(
+            system_id=int(system_id),
+            flavour="px4",
+            first_s=first_s,
+            last_s=last_s,
+            reboots=0,
+            messages={name: len(table) for name, table in tables.topics.items()},
+            origin=origin,
+            home=None,
+            first_fix=_first_fix(_gps_table(tables)),
+            estimate_frame="fleet" if origin is not None else estimate_frame,
+            truth_from=next((name for name in tables.topics if name == "vehicle_local_position_groundtruth"), None),
+        )
+        return LogSurvey(_unix(tables), first_s, last_s, {system.system_id: system})
+
+
+def _arrival(timed: Timed) -> float:
+    return timed[0]
+
+
+def _gps_table(tables: Tables) -> Table | None:
+    """The topic with most fixes: firmware logs the receiver's and the blended one, each at its own rate."""
+    found = [tables.topics[name] for name in GPS_TOPICS if name in tables.topics]
+    return max(found, key=len) if found else None
+
+
+def _reference(local: Table) -> GeodeticPoint | None:
+    """The first origin of the local frame."""
+    where = local.stack("ref_lat", "ref_lon", "ref_alt")
+    if where is None:
+        return None
+    usable = np.isfinite(where).all(axis=1) & (where[:, :2] != 0.0).any(axis=1)
+    if "xy_global" in local.columns:
+        usable &= local.columns["xy_global"].astype(bool)
+    if not usable.any():
+        return None
+    lat_deg, lon_deg, alt_m = (float(value) for value in where[int(np.argmax(usable))])
+    return GeodeticPoint(lat_deg, lon_deg, alt_m) if abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0 else None
+
+
+def _first_fix(gps: Table | None) -> GeodeticPoint | None:
+    if gps is None or "fix_type" not in gps.columns:
+        return None
+    where = degrees(gps)
+    if where is None:
+        return None
+    fixed = (gps.columns["fix_type"] >= _FIX_3D) & np.isfinite(where).all(axis=1)
+    if not fixed.any():
+        return None
+    lat_deg, lon_deg, alt_m = (float(value) for value in where[int(np.argmax(fixed)), :3])
+    return GeodeticPoint(lat_deg, lon_deg, alt_m)
+
+
+def _unix(tables: Tables) -> UnixZero:
+    """From the receiver's UTC, else from an exchange of time with a companion whose clock is Unix time."""
+    gps = _gps_table(tables)
+    if gps is not None and "time_utc_usec" in gps.columns:
+        utc_us = gps.columns["time_utc_usec"]
+        known = utc_us > UNIX_US
+        pairs = list(zip((gps.timestamp_us[known] * 1e-6).tolist(), (utc_us[known] * 1e-6).tolist(), strict=True))
+        line = fitted(pairs)
+        if line is not None:
+            return UnixZero(line[0], math.hypot(line[2], RECEIVER_LATENCY_SIGMA_S), "gps", line[1])
+    timesync = tables.topics.get("timesync_status")
+    if timesync is not None and {"remote_timestamp", "observed_offset"} <= set(timesync.columns):
+        unix_us = timesync.columns["remote_timestamp"]
+        known = unix_us > UNIX_US
+        unix_s = unix_us[known] * 1e-6
+        boot_s = (unix_us[known].astype(np.int64) + timesync.columns["observed_offset"][known]) * 1e-6
+        line = fitted(list(zip(boot_s.tolist(), unix_s.tolist(), strict=True)))
+        if line is not None:
+            return UnixZero(line[0], math.hypot(line[2], TIMESYNC_SIGMA_S), "host", line[1])
+    return UnixZero(0.0, math.inf, "unknown")

@@ -1,0 +1,1 @@
+"""Studies over tick-level recordings: scenario, links, the exchange, the genie, Monte Carlo."""

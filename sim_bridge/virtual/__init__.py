@@ -1,0 +1,1 @@
+"""Fleets of the agents' own cores in virtual time."""

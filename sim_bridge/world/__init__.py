@@ -1,0 +1,1 @@
+"""The simulated world: vehicles, sensors, truth, and the process that serves them."""

@@ -1,0 +1,54 @@
+"""A fleet's configuration as a scenario of the simulator."""
+
+from __future__ import annotations
+
+from agent.config import tables as tables
+from agent.sensing.frames import FleetFrame, gravity_mps2
+from sim_bridge.world.guidance import Circle, FigureEight, Path, Waypoints
+from sim_bridge.world.noise import FlavourName
+from sim_bridge.world.scenario import Interval, Scenario, Vehicle
+
+
+def scenario_from_config(config: tables.FleetConfig) -> Scenario:
+    """The scenario that ``[sim]`` and the fleet's tables describe.
+
+    An autopilot given as ``auto`` is a PX4. Raises `ScenarioError` for what the simulator cannot
+    do, e.g. a rate above its own.
+    """
+    sim = config.sim
+    paths = {table.agent: _path(table) for table in sim.paths}
+    return Scenario(
+        vehicles=tuple(_vehicle(config, agent, paths.get(agent.id)) for agent in config.agents),
+        frame=FleetFrame.of(config),
+        seed=sim.seed,
+        profile=sim.profile,
+        period_s=config.fleet.period_s,
+        epoch_unix_s=config.fleet.epoch_unix_s,
+        edges=config.fleet.edges,
+        gravity_mps2=gravity_mps2(config),
+        imu_hz=sim.imu_hz,
+        attitude_hz=sim.attitude_hz,
+        gps_hz=sim.gps_hz,
+        uwb_hz=sim.uwb_hz,
+        uwb_staggered=sim.profile == "realistic",
+        gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
+        max_accel_mps2=sim.max_accel_mps2,
+        start_position_half_width_m=sim.start_position_half_width_m,
+        start_speed_half_width_mps=sim.start_speed_half_width_mps,
+        gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
+    )
+
+
+def _vehicle(config: tables.FleetConfig, agent: tables.AgentTable, path: Path | None) -> Vehicle:
+    flavour: FlavourName = "ardupilot" if agent.autopilot == "ardupilot" else "px4"
+    return Vehicle(agent.id, flavour, config.system_id(agent.id), path)
+
+
+def _path(table: tables.Path) -> Path:
+    match table:
+        case tables.WaypointsPath():
+            return Waypoints(table.points_m, table.hold_s, table.repeat)
+        case tables.CirclePath():
+            return Circle(table.center_m, table.radius_m, table.lap_s, table.phase_rad)
+        case tables.FigureEightPath():
+            return FigureEight(table.center_m, table.length_m, table.width_m, table.lap_s, table.phase_rad)

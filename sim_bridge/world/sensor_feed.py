@@ -1,0 +1,93 @@
+"""The sensors of a simulated fleet without its autopilots: samples as values, no bytes, no handshakes.
+
+For studies in virtual time that ask about the estimate and not about the wires. The world, the sensors and
+their noise are those of the simulation; what is left out is encoding with its rounding, clock
+synchronisation and everything an autopilot says besides its sensors. Sans-I/O.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+from agent.sensing.samples import AttitudeSample, ImuSample
+from sim_bridge.autopilot.mavlink_wire import gps_raw_int
+from sim_bridge.world.sensors import RangeSet, quaternion_of, vector_of
+from sim_bridge.world.simulation import Simulation
+from sim_bridge.world.truth import Truth, TruthRecorder
+
+GRID_TOLERANCE = 1e-6
+
+
+@dataclass(slots=True)
+class Sensed:
+    """What left the sensors in one step: samples and GPS_RAW_INT messages by agent, and range sets.
+
+    A fix stays a message since the agent makes its variances of what the receiver says.
+    """
+
+    samples: list[tuple[int, ImuSample | AttitudeSample]] = field(default_factory=list)
+    fixes: list[tuple[int, Any]] = field(default_factory=list)
+    ranges: list[RangeSet] = field(default_factory=list)
+
+
+class _Grid:
+    """Which steps a sensor of a rate falls on."""
+
+    def __init__(self, rate_hz: float, step_s: float) -> None:
+        self._per_step = rate_hz * step_s
+        self._taken = 0
+
+    def due(self, step: int) -> bool:
+        count = int(step * self._per_step + GRID_TOLERANCE)
+        due, self._taken = count > self._taken, count
+        return due
+
+
+class SensorFeed:
+    """Steps the world of a simulation in its place.
+
+    ``imu_hz`` and ``attitude_hz`` are the rates asked for; a sensor gives at most its own. Samples are in fleet
+    time, which is ``start_fleet_s`` at the start; stamps of messages count from the start.
+    """
+
+    def __init__(self, simulation: Simulation, imu_hz: float, attitude_hz: float, start_fleet_s: float) -> None:
+        self._simulation = simulation
+        self._start_fleet_s = start_fleet_s
+        scenario, step_s = simulation.scenario, simulation.world.step_s
+        self._imu = _Grid(min(imu_hz, scenario.imu_hz), step_s)
+        self._attitude = _Grid(min(attitude_hz, scenario.attitude_hz), step_s)
+        self._truth_every = max(round(1.0 / (scenario.truth_hz * step_s)), 1)
+        self._recorder = TruthRecorder(scenario.ids, simulation.sensors.pair_bias_m)
+        self._record()
+
+    def step(self) -> Sensed:
+        """Move the world by one step."""
+        world, sensors, scenario = self._simulation.world, self._simulation.sensors, self._simulation.scenario
+        world.step()
+        if world.step_index % self._truth_every == 0:
+            self._record()
+        sensed = Sensed(ranges=sensors.ranges())
+        t_s = self._start_fleet_s + world.time_s
+        imu_due, attitude_due = self._imu.due(world.step_index), self._attitude.due(world.step_index)
+        for slot, agent_id in enumerate(scenario.ids):
+            if attitude_due:
+                attitude = AttitudeSample(t_s, quaternion_of(sensors.attitude(slot)))
+                sensed.samples.append((agent_id, attitude))
+            if imu_due:
+                imu = sensors.imu(slot)
+                sample = ImuSample(t_s, vector_of(imu.accel_mps2), vector_of(imu.gyro_rps))
+                sensed.samples.append((agent_id, sample))
+        for slot, fix in sensors.fixes():
+            if fix.valid:
+                sensed.fixes.append((scenario.ids[slot], gps_raw_int(round(1e6 * fix.time_s), fix)))
+        return sensed
+
+    def truth(self) -> Truth:
+        """What happened so far."""
+        return self._recorder.truth()
+
+    def _record(self) -> None:
+        simulation, world = self._simulation, self._simulation.world
+        time_unix_s = simulation.start_s + world.time_s + simulation.unix_offset_s
+        self._recorder.record(time_unix_s, world.position_m, world.velocity_mps)

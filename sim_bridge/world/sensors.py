@@ -1,0 +1,377 @@
+"""What the sensors of the fleet say about the world, noise included. Sans-I/O; one generator per sensor.
+
+Every agent and sensor draws from a stream of its own, so that another sensor's rate changes nothing.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_bridge.world import geodesy, quaternions
+from sim_bridge.world.noise import PROFILES, GaussMarkov, GpsNoise, ImuNoise, UwbNoise, uncalibrated
+from sim_bridge.world.quaternions import Array
+from sim_bridge.world.scenario import Scenario
+from sim_bridge.world.world import FleetWorld
+
+EARTH_FIELD_GAUSS = (0.21, 0.0, 0.43)
+"""NED, a mid-latitude field without declination."""
+GRID_TOLERANCE_S = 1e-6
+
+
+@dataclass(frozen=True, slots=True)
+class ImuSample:
+    """Mean over the last inner step, body FRD: ``accel_mps2`` (specific force) and ``gyro_rps`` ``(3,)``."""
+
+    time_s: float
+    accel_mps2: Array
+    gyro_rps: Array
+    mag_gauss: Array
+    pressure_hpa: float
+    pressure_alt_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class AttitudeSample:
+    """``quaternion`` ``(4,)`` w x y z, body FRD into NED; ``rates_rps`` ``(3,)`` body."""
+
+    time_s: float
+    quaternion: Array
+    rates_rps: Array
+
+
+def vector_of(array: Array) -> tuple[float, float, float]:
+    """Three plain numbers."""
+    x, y, z = array.tolist()
+    return x, y, z
+
+
+def quaternion_of(attitude: AttitudeSample) -> tuple[float, float, float, float]:
+    """Four plain numbers, w x y z."""
+    w, x, y, z = attitude.quaternion.tolist()
+    return w, x, y, z
+
+
+@dataclass(frozen=True, slots=True)
+class GpsFix:
+    """One solution of a receiver, or its word that it has none (``valid`` false, the rest meaningless)."""
+
+    time_s: float
+    """What the stamp says."""
+    valid: bool
+    lat_deg: float = 0.0
+    lon_deg: float = 0.0
+    alt_msl_m: float = 0.0
+    alt_ellipsoid_m: float = 0.0
+    speed_mps: float = 0.0
+    course_rad: float = 0.0
+    """Over ground, clockwise from north, 0..2 pi."""
+    position_ned_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """The same position in the fleet frame, for the autopilot's own navigation."""
+    velocity_ned_mps: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    h_acc_m: float = 0.0
+    v_acc_m: float = 0.0
+    speed_acc_mps: float = 0.0
+    hdop: float = 0.0
+    vdop: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
+class RangeMeasurement:
+    """A range to one agent; received powers in dBm, probability of no line of sight."""
+
+    target: int
+    range_m: float
+    sigma_m: float
+    rx_dbm: float
+    first_path_dbm: float
+    nlos: float
+
+
+@dataclass(frozen=True, slots=True)
+class RangeSet:
+    """All ranges that one observer took at ``time_s``."""
+
+    observer: int
+    time_s: float
+    ranges: tuple[RangeMeasurement, ...]
+
+
+def pressure_hpa(alt_msl_m: float) -> float:
+    """Pressure of the standard atmosphere's troposphere."""
+    return float(1013.25 * (1.0 - 2.25577e-5 * alt_msl_m) ** 5.25588)
+
+
+class _Imu:
+    """Errors of one vehicle's inertial sensors."""
+
+    def __init__(self, noise: ImuNoise, rng: np.random.Generator) -> None:
+        self._noise, self._rng = noise, rng
+        self._accel_bias = noise.accel_bias_sigma_mps2 * rng.standard_normal(3)
+        self._gyro_bias = noise.gyro_bias_sigma_rps * rng.standard_normal(3)
+
+    def accel(self, true: Array) -> Array:
+        white = self._noise.accel_sigma_mps2
+        if white == 0.0:
+            return true + self._accel_bias
+        return np.asarray(true + self._accel_bias + white * self._rng.standard_normal(3))
+
+    def gyro(self, true: Array) -> Array:
+        white = self._noise.gyro_sigma_rps
+        if white == 0.0:
+            return true + self._gyro_bias
+        return np.asarray(true + self._gyro_bias + white * self._rng.standard_normal(3))
+
+
+class _HeldNoise:
+    """The paper's input noise: one draw per fleet tick and vehicle, NED, uniform."""
+
+    def __init__(self, half_width: Array, rngs: list[np.random.Generator]) -> None:
+        self._half_width, self._rngs = half_width, rngs
+        self._tick: int | None = None
+        self.value: Array = np.zeros((len(rngs), 3))
+
+    def at_tick(self, tick: int) -> Array:
+        if tick != self._tick and self._half_width.any():
+            draws = [rng.uniform(-1.0, 1.0, 3) for rng in self._rngs]
+            self.value = self._half_width[:, None] * np.array(draws)
+        self._tick = tick
+        return self.value
+
+
+class _Receiver:
+    """One GPS receiver: fixes on its own grid, late and wandering by its noise."""
+
+    def __init__(self, noise: GpsNoise, speed: str, rng: np.random.Generator) -> None:
+        self._noise, self._speed, self._rng = noise, speed, rng
+        wander = np.array((noise.horizontal_wander_m, noise.horizontal_wander_m, noise.vertical_wander_m))
+        self._wander = GaussMarkov(wander, noise.wander_correlation_s, rng)
+
+    def solve(self, time_s: float, position: Array, velocity: Array, accel: Array) -> tuple[Array, Array]:
+        """Position and velocity ``(3,)`` NED as the receiver has them."""
+        noise, rng = self._noise, self._rng
+        lag_s = noise.stamp_lag_s
+        seen = position - lag_s * velocity + 0.5 * lag_s**2 * accel
+        uniform = noise.position_uniform_m * rng.uniform(-1.0, 1.0, 3)
+        sigma = np.array((noise.horizontal_sigma_m, noise.horizontal_sigma_m, noise.vertical_sigma_m))
+        white = sigma * rng.standard_normal(3)
+        speed_noise = noise.velocity_sigma_mps * rng.standard_normal(3)
+        return seen + uniform + white + self._wander.at(time_s), velocity - lag_s * accel + speed_noise
+
+    def speed_and_course(self, velocity: Array) -> tuple[float, float]:
+        """The two numbers that GPS_RAW_INT has; the speed's uniform noise is along the course."""
+        north, east, down = (float(axis) for axis in velocity)
+        ground = math.hypot(north, east)
+        speed = math.hypot(ground, down) if self._speed == "norm" else ground
+        speed += self._noise.speed_uniform_mps * float(self._rng.uniform(-1.0, 1.0))
+        course = math.atan2(east, north) + (math.pi if speed < 0.0 else 0.0)
+        return abs(speed), course % (2.0 * math.pi)
+
+
+class _Channel:
+    """Errors of the ranges between the agents."""
+
+    def __init__(self, noise: UwbNoise, ids: tuple[int, ...], seeds: np.random.SeedSequence) -> None:
+        self._noise = noise
+        own, *per_agent = seeds.spawn(1 + len(ids))
+        rng = np.random.default_rng(own)
+        self._rngs = {agent: np.random.default_rng(seed) for agent, seed in zip(ids, per_agent, strict=True)}
+        self.bias_m = {
+            frozenset((a, b)): noise.bias_mean_m
+            + noise.bias_sigma_m * float(rng.standard_normal())
+            + noise.bias_uniform_m * float(rng.uniform(-1.0, 1.0))
+            for i, a in enumerate(ids)
+            for b in ids[i + 1 :]
+        }
+        self._phase_rad = {agent: float(rng.uniform(0.0, 2.0 * math.pi)) for agent in ids}
+
+    def measure(self, observer: int, target: int, true_m: float, bearing_rad: float) -> RangeMeasurement:
+        """A range over the true distance; ``bearing_rad`` of the target in the observer's body frame."""
+        noise, rng = self._noise, self._rngs[observer]
+        uniform = noise.uniform_m * float(rng.uniform(-1.0, 1.0))
+        white = noise.sigma_m * float(rng.standard_normal())
+        blocked = float(rng.random()) < noise.nlos_probability
+        detour = min(float(rng.exponential(noise.nlos_mean_m)), noise.nlos_max_m)
+        lobe = noise.orientation_m * math.sin(bearing_rad + self._phase_rad[observer])
+        bias = self.bias_m[frozenset((observer, target))]
+        error = uniform + white + bias + lobe + (detour if blocked else 0.0)
+        rx_dbm = -60.0 - 20.0 * math.log10(max(true_m, 1.0)) - (6.0 if blocked else 0.0)
+        first_path_dbm = rx_dbm - float(rng.uniform(7.0, 14.0) if blocked else rng.uniform(1.0, 4.0))
+        nlos = float(rng.uniform(0.5, 1.0) if blocked else rng.uniform(0.0, 0.3))
+        range_m = max(true_m + error, 0.01)
+        return RangeMeasurement(target, range_m, noise.reported_sigma_m, rx_dbm, first_path_dbm, nlos)
+
+
+class _Grid:
+    """Times ``phase + j / rate``; says when the next has come."""
+
+    def __init__(self, rate_hz: float, phase_s: float = 0.0) -> None:
+        self._rate_hz, self._phase_s = rate_hz, phase_s
+        # nobody asks at time zero: a point there would be noticed a step late, off the grid
+        self._next = 0 if phase_s > 0.0 else 1
+
+    def due(self, time_s: float) -> bool:
+        """Whether a new point of the grid was reached; points passed over are skipped."""
+        point = math.floor((time_s - self._phase_s + GRID_TOLERANCE_S) * self._rate_hz)
+        if point < self._next:
+            return False
+        self._next = point + 1
+        return True
+
+
+class FleetSensors:
+    """All sensors of the fleet over one world; ask after each step of it.
+
+    ``start_fleet_s``: fleet time (seconds since the configured epoch) at the start of the run; it aligns the
+    paper's input noise with the ticks.
+    """
+
+    def __init__(self, scenario: Scenario, world: FleetWorld, start_fleet_s: float = 0.0) -> None:
+        self._scenario, self._world, self._start_fleet_s = scenario, world, start_fleet_s
+        profile = PROFILES[scenario.profile]
+        count = len(scenario.ids)
+        kinds = np.random.SeedSequence((scenario.seed, 1)).spawn(5)
+        imu, held, attitude, gps = ([np.random.default_rng(seed) for seed in kind.spawn(count)] for kind in kinds[:4])
+        imu_noise = [profile.imu[vehicle.flavour] for vehicle in scenario.vehicles]
+        self._imu = [_Imu(noise, rng) for noise, rng in zip(imu_noise, imu, strict=True)]
+        self._held = _HeldNoise(np.array([noise.held_uniform_mps2 for noise in imu_noise]), held)
+        tilt, heading = profile.attitude.tilt_sigma_rad, profile.attitude.heading_sigma_rad
+        self._attitude_error = [
+            GaussMarkov(np.array((tilt, tilt, heading)), profile.attitude.correlation_s, rng) for rng in attitude
+        ]
+        self._gps_noise = profile.gps
+        self._receivers = [_Receiver(profile.gps, scenario.gps_speed, rng) for rng in gps]
+        self._gps_grid = _Grid(scenario.gps_hz)
+        self._undelivered: deque[tuple[float, int, GpsFix]] = deque()
+        uwb = profile.uwb if scenario.uwb_calibrated else uncalibrated(profile.uwb)
+        self._channel = _Channel(uwb, scenario.ids, kinds[4])
+        cycle_s = 1.0 / scenario.uwb_hz
+        self._uwb_grids = [
+            _Grid(scenario.uwb_hz, cycle_s * slot / count if scenario.uwb_staggered else 0.0) for slot in range(count)
+        ]
+        self._body_step = -1
+        self._body_force = np.zeros((count, 3))
+        self._body_rates = np.zeros((count, 3))
+        self._body_field = np.zeros((count, 3))
+
+    @property
+    def pair_bias_m(self) -> dict[frozenset[int], float]:
+        """Truth of the ranges' bias per pair of agents."""
+        return self._channel.bias_m
+
+    def _to_body(self) -> None:
+        """Turn what acts in NED into the body frames, once per step for the whole fleet."""
+        if self._body_step == self._world.step_index:
+            return
+        world = self._world
+        middle_s = self._start_fleet_s + world.time_s - 0.5 * world.step_s
+        held = self._held.at_tick(math.floor(middle_s / self._scenario.period_s))
+        # v R is R^T v: the row vector on the left turns NED into body
+        matrices = quaternions.matrices(world.attitude())
+        self._body_force = ((world.specific_force_ned() + held)[:, None, :] @ matrices)[:, 0]
+        self._body_field = np.array(EARTH_FIELD_GAUSS) @ matrices
+        self._body_rates = world.body_rates()
+        self._body_step = world.step_index
+
+    def imu(self, slot: int) -> ImuSample:
+        """A new sample of one vehicle's inertial sensors, magnetometer and barometer."""
+        self._to_body()
+        frame = self._scenario.frame
+        alt_msl_m = geodesy.msl_m(frame, frame.alt_m - float(self._world.position_m[slot, 2]))
+        return ImuSample(
+            self._world.time_s,
+            self._imu[slot].accel(self._body_force[slot]),
+            self._imu[slot].gyro(self._body_rates[slot]),
+            self._body_field[slot],
+            pressure_hpa(alt_msl_m),
+            alt_msl_m,
+        )
+
+    def attitude(self, slot: int) -> AttitudeSample:
+        """What the autopilot of one vehicle takes for its attitude."""
+        self._to_body()
+        time_s = self._world.time_s
+        quaternion = self._world.attitude()[slot]
+        error = self._attitude_error[slot].at(time_s)
+        if error.any():
+            turn = quaternions.from_rotation_vector(error[None])
+            quaternion = quaternions.multiply(quaternion[None], turn)[0]
+        return AttitudeSample(time_s, quaternion, self._imu[slot].gyro(self._body_rates[slot]))
+
+    def fixes(self) -> list[tuple[int, GpsFix]]:
+        """Slots and fixes whose messages leave the receivers at this step."""
+        time_s = self._world.time_s
+        if self._gps_grid.due(time_s):
+            leaves_s = time_s + self._gps_noise.delivery_s
+            self._undelivered += [(leaves_s, slot, fix) for slot, fix in enumerate(self._solve_all())]
+        delivered = []
+        while self._undelivered and self._undelivered[0][0] <= time_s + GRID_TOLERANCE_S:
+            _, slot, fix = self._undelivered.popleft()
+            delivered.append((slot, fix))
+        return delivered
+
+    def _solve_all(self) -> list[GpsFix]:
+        scenario, world = self._scenario, self._world
+        states = zip(world.position_m, world.velocity_mps, world.accel_mps2, strict=True)
+        solved = [
+            receiver.solve(world.time_s, *state) for receiver, state in zip(self._receivers, states, strict=True)
+        ]
+        positions = np.array([position for position, _ in solved])
+        for jump in scenario.gps_jumps:
+            if world.time_s >= jump.at_s:
+                positions[scenario.slot(jump.agent)] += jump.offset_m
+        places = geodesy.geodetic(scenario.frame, positions)
+        velocities = [velocity for _, velocity in solved]
+        return [self._fix(slot, *entry) for slot, entry in enumerate(zip(positions, velocities, places, strict=True))]
+
+    def _fix(self, slot: int, position: Array, velocity: Array, place: Array) -> GpsFix:
+        scenario, noise, time_s = self._scenario, self._gps_noise, self._world.time_s
+        # drawn in an outage too, so that one does not change the noise after it
+        speed_mps, course_rad = self._receivers[slot].speed_and_course(velocity)
+        agent = scenario.ids[slot]
+        if any(outage.agent == agent and outage.holds(time_s) for outage in scenario.gps_outages):
+            return GpsFix(time_s, valid=False)
+        lat_deg, lon_deg, height_m = place.tolist()
+        return GpsFix(
+            time_s,
+            valid=True,
+            lat_deg=lat_deg,
+            lon_deg=lon_deg,
+            alt_msl_m=geodesy.msl_m(scenario.frame, height_m),
+            alt_ellipsoid_m=geodesy.ellipsoid_m(scenario.frame, height_m),
+            speed_mps=speed_mps,
+            course_rad=course_rad,
+            position_ned_m=vector_of(position),
+            velocity_ned_mps=vector_of(velocity),
+            h_acc_m=noise.h_acc_m,
+            v_acc_m=noise.v_acc_m,
+            speed_acc_mps=noise.speed_acc_mps,
+            hdop=noise.hdop,
+            vdop=noise.vdop,
+        )
+
+    def ranges(self) -> list[RangeSet]:
+        """The ranges taken at this step, a set per observer whose turn it is."""
+        time_s = self._world.time_s
+        sets = []
+        for slot, observer in enumerate(self._scenario.ids):
+            if self._uwb_grids[slot].due(time_s):
+                measured = tuple(self._range_all(slot, observer))
+                if measured:
+                    sets.append(RangeSet(observer, time_s, measured))
+        return sets
+
+    def _range_all(self, slot: int, observer: int) -> list[RangeMeasurement]:
+        positions = self._world.position_m
+        measured = []
+        for target in self._scenario.ranged_by(observer):
+            between = positions[self._scenario.slot(target)] - positions[slot]
+            north, east, down = (float(axis) for axis in between)
+            distance_m = math.sqrt(north * north + east * east + down * down)
+            if distance_m <= self._scenario.uwb_reach_m:
+                bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
+                measured.append(self._channel.measure(observer, target, distance_m, bearing_rad))
+        return measured

@@ -1,0 +1,187 @@
+"""The configuration: what is read, what is refused, and in which words."""
+
+from __future__ import annotations
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from agent.config.reading import config_from, dump, load_config, load_estimator_settings
+from agent.config.tables import CirclePath
+from agent.errors import ConfigError
+from estimators.settings import EstimatorSettings
+
+CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.toml"))
+LINE3 = next(path for path in CONFIGS if path.stem == "line3")
+FLEETS = [path for path in CONFIGS if path.stem in ("line3", "mesh5", "gps_loss")]
+
+
+@pytest.mark.parametrize("path", FLEETS, ids=lambda path: path.stem)
+def test_a_shipped_configuration_survives_dump_and_load(path: Path) -> None:
+    config = load_config(path)
+    assert config_from(tomllib.loads(dump(config)), "dump") == config
+
+
+def test_the_three_fleets_are_what_they_say() -> None:
+    line3, mesh5, gps_loss = (load_config(LINE3.with_stem(name)) for name in ("line3", "mesh5", "gps_loss"))
+    assert line3.neighbours(2) == (1, 3)
+    assert line3.neighbours(1) == (2,)
+    assert line3.fleet.period_s == 0.1
+    assert mesh5.neighbours(3) == (1, 2, 4, 5)
+    assert [outage.agent for outage in gps_loss.sim.gps_outages] == [4]
+    for config in (line3, mesh5, gps_loss):
+        assert {path.agent for path in config.sim.paths} == set(config.ids)
+
+
+def test_no_two_shipped_fleets_share_a_port() -> None:
+    taken: list[str] = []
+    for path in FLEETS:
+        config = load_config(path)
+        taken += [agent.mavlink for agent in config.agents]
+        taken += [endpoint for agent in config.ids for endpoint in config.listen(agent)]
+    assert len(set(taken)) == len(taken)
+
+
+def test_of_two_neighbours_the_one_with_the_higher_id_dials() -> None:
+    config = load_config(LINE3)
+    assert config.listen(2) == ("tcp/127.0.0.1:17448",)
+    assert config.connect(1) == ()
+    assert config.connect(3) == ("tcp/127.0.0.1:17448",)
+
+
+def test_overrides_beat_the_file_and_speak_toml() -> None:
+    overrides = [
+        "estimator.window=3",
+        "estimator.kind=dekf_ci",
+        "agents.2.mavlink=udpin:127.0.0.1:24552",
+        'agents.2.name="two = 2"',
+        "sim.paths.1.radius_m=9.5",
+        "record.directory=out",
+        "transport.information_format=float32",
+    ]
+    config = load_config(LINE3, overrides)
+    assert (config.estimator.window, config.estimator.kind) == (3, "dekf_ci")
+    assert (config.agent(2).mavlink, config.agent(2).name) == ("udpin:127.0.0.1:24552", "two = 2")
+    path = config.sim.paths[0]
+    assert isinstance(path, CirclePath)
+    assert path.radius_m == 9.5
+    assert config.record.directory == "out"
+    assert config.transport.information_format == "float32"
+
+
+@pytest.mark.parametrize(
+    ("override", "key", "expected", "found"),
+    [
+        ("estimator.windo=3", "estimator.windo", "one of kind, window, rounds", "an unknown key"),
+        ("estimator.window=0", "estimator.window", "a whole number >= 1", "0"),
+        ("estimator.window=many", "estimator.window", "a whole number", "'many'"),
+        ("estimator.kind=ekf", "estimator.kind", "one of dmhe_pre_ekf, dmhe", "'ekf'"),
+        ("fleet.period_s=fast", "fleet.period_s", "a number", "'fast'"),
+        ("fleet.period_s=inf", "fleet.period_s", "a finite number", "inf"),
+        ("sensors.gps_latency_s=nan", "sensors.gps_latency_s", "a finite number", "nan"),
+        ("fleet.origin.lat_deg=100", "fleet.origin.lat_deg", "a number <= 90", "100"),
+        ("fleet.origin.height=1", "fleet.origin.height", "one of lat_deg, lon_deg, alt_m", "an unknown key"),
+        ("fleet.name=Upper Case", "fleet.name", "a string matching regex", "'Upper Case'"),
+        ("fleet=3", "fleet", "a table", "3"),
+        ("agents=[]", "agents", "an array of length >= 1", "[]"),
+        ("unknown=1", "unknown", "one of fleet, agents, estimator", "an unknown key"),
+        ("agents.9.name=x", "agents.9", "one of the ids 1, 2, 3", "9"),
+        ("agents.1.autopilot=apm", "agents[0].autopilot", "one of px4, ardupilot, auto", "'apm'"),
+        ("agents.1.mavlink=udp", "agents[0].mavlink", "udpin:HOST:PORT", "names no transport"),
+        ("agents.1.mavlink=udpout::1", "agents[0].mavlink", "udpin:HOST:PORT", "no host"),
+        ("agents.1.mavlink=udpin:127.0.0.1:14552", "agents[1].mavlink", "another address", "14552"),
+        ("agents.1.mavlink=serial:/dev/ttyS0:57600", "agents[0].mavlink", "a baud rate of 154714", "57600"),
+        ("agents.1.id=2", "agents[1].id", "distinct ids", "a second agent 2"),
+        ("agents.3.id=300", "agents[2].system_id", "1..255", "nothing"),
+        ("agents.1={}", "agents[0].id", "a value (the key is required)", "nothing"),
+        ("fleet.edges=[[1,7]]", "fleet.edges[0]", "ids of agents (1, 2, 3)", "7"),
+        ("fleet.edges=[[1,1]]", "fleet.edges[0]", "two different agents", "[1, 1]"),
+        ("sim.paths.1.kind=loop", "sim.paths[0].kind", "one of waypoints, circle, figure_eight", "'loop'"),
+        ("sim.paths.1.points_m=[]", "sim.paths[0].points_m", "one of kind, agent, center_m", "unknown"),
+        ("sim.paths.1.center_m=[1,2]", "sim.paths[0].center_m", "an array of length 3", "[1, 2]"),
+        ("sim.paths.1.agent=2", "sim.paths[1].agent", "one path per agent", "a second path of agent 2"),
+        ("sim.paths.1.agent=8", "sim.paths[0].agent", "ids of agents", "8"),
+        ("transport.exchange_fraction=0.9", "transport.rounds_fraction", "at most 1 together", "1.3"),
+        ("transport.guard_s=0.05", "transport.guard_s", "less than", "0.05"),
+        ("agents.1.mavlink=tcpout:..bad:5760", "agents[0].mavlink", "tcpout:HOST:PORT", "host '..bad' is no address"),
+        ('agents.1.listen=["tcp/127.0.0.1:99999"]', "agents[0].listen[0]", "a port 0..65535", "99999"),
+        ('agents.1.connect=["tcp/127.0.0.1:1","udp/10.0.0.2:abc"]', "agents[0].connect[1]", "a port 1..65535", "abc"),
+        ('agents.1.listen=["tcp/10.0.0.256:7447"]', "agents[0].listen[0]", "a host's name or address", "10.0.0.256"),
+        ('agents.1.listen=["http/10.0.0.2:80"]', "agents[0].listen[0]", "one of tls/HOST:PORT", "http/10.0.0.2:80"),
+        ("agents.1.radio=192.168.7.3:7447", "agents[0].radio", "without port", "192.168.7.3:7447"),
+        ("agents.1.radio=fe80::1", "agents[0].radio", "IPv6 in brackets", "fe80::1"),
+        ("metrics.base_port=65535", "metrics.base_port", "a port for each agent up to 65535", "65537 for the last"),
+        ("metrics.host=0.0.0", "metrics.host", "an address to listen on", "0.0.0"),
+        ("adsb.address=foo", "adsb.address", "udpout:HOST:PORT", "names no transport"),
+        ("estimator.kind=centralized_ekf", "estimator.kind", "a kind for agents", "centralized_ekf"),
+        ("nonsense", "nonsense", "key=value with a dotted key", "'nonsense'"),
+        ("fleet..name=1", "fleet..name", "key=value with a dotted key", "'fleet..name=1'"),
+        ("fleet.name.x=1", "fleet.name", "a table", "'line3'"),
+    ],
+)
+def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
+    override: str, key: str, expected: str, found: str
+) -> None:
+    with pytest.raises(ConfigError) as caught:
+        load_config(LINE3, [override])
+    assert caught.value.key == key
+    assert expected in caught.value.expected
+    assert found in caught.value.found
+    assert "\n" not in str(caught.value)
+    assert str(caught.value).startswith(("override: ", str(LINE3)))
+
+
+def test_an_outage_must_end_after_it_begins() -> None:
+    document = tomllib.loads(LINE3.read_text())
+    document["sim"]["gps_outages"] = [{"agent": 1, "from_s": 5.0, "to_s": 5.0}]
+    with pytest.raises(ConfigError, match=r"sim.gps_outages\[0\].to_s: expected later than from_s = 5.0"):
+        config_from(document, "here")
+
+
+def test_the_centralised_filter_is_for_studies_and_no_agents() -> None:
+    assert load_estimator_settings(None, ["estimator.kind=centralized_ekf"]).kind == "centralized_ekf"
+    with pytest.raises(ConfigError, match=r"estimator.kind: expected a kind for agents; .* `fleetloc estimate`"):
+        load_config(LINE3, ["estimator.kind=centralized_ekf"])
+
+
+@pytest.mark.parametrize("ids", ["[]", "{ a = 1 }", "1.5"])
+def test_a_profile_whose_ids_are_none_is_refused_by_key(tmp_path: Path, ids: str) -> None:
+    profile = tmp_path / "over.toml"
+    profile.write_text(f"[[agents]]\nid = {ids}\nmavlink = 'udpin:127.0.0.1:1'\n")
+    with pytest.raises(ConfigError, match=rf"line3.toml with {profile}: agents\[0\].id: expected a whole number"):
+        load_config(LINE3, (), [profile])
+
+
+def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
+    missing, broken, huge = (tmp_path / name for name in ("missing.toml", "broken.toml", "huge.toml"))
+    broken.write_text("[fleet\n")
+    huge.write_bytes(b"#" * 1_000_001)
+    with pytest.raises(ConfigError, match=r"missing.toml: file: expected a readable TOML file, found No such"):
+        load_config(missing)
+    with pytest.raises(ConfigError, match=r"broken.toml: syntax: expected valid TOML"):
+        load_config(broken)
+    with pytest.raises(ConfigError, match="at most 1000000 bytes"):
+        load_config(huge)
+
+
+def test_a_kind_brings_its_own_defaults_and_what_is_written_beats_them() -> None:
+    nothing_said = load_estimator_settings(None)
+    assert (nothing_said.kind, nothing_said.window, nothing_said.relay_hops) == ("dmhe_relay", 6, 2)
+    assert nothing_said == load_config(LINE3).estimator
+    paper = load_estimator_settings(None, ["estimator.kind=dmhe_pre_ekf"])
+    assert paper == EstimatorSettings()
+    assert (paper.window, paper.rounds, paper.share_inputs, paper.relay_hops) == (2, 1, "none", 0)
+    longer = load_estimator_settings(None, ["estimator.window=9"])
+    assert (longer.kind, longer.window, longer.share_inputs) == ("dmhe_relay", 9, "fleet")
+
+
+def test_drones_with_addresses_on_the_radio_may_have_the_same_device() -> None:
+    document = tomllib.loads(LINE3.read_text())
+    for agent in document["agents"]:
+        agent["mavlink"] = "serial:/dev/ttyAMA0:921600"
+    with pytest.raises(ConfigError, match=r"agents\[1\].mavlink: expected another address than agent 1's"):
+        config_from(document, "here")
+    for agent in document["agents"]:
+        agent["radio"] = f"192.168.7.{agent['id']}"
+    assert config_from(document, "here").agent(3).mavlink == "serial:/dev/ttyAMA0:921600"

@@ -1,0 +1,288 @@
+"""Samples to records to rows, and the store that hands them out once."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.config.tables import FleetConfig, SensorsTable
+from agent.fleet.record_store import RecordStore
+from agent.fleet.records import acceleration_record, gps_records, inputs_of, range_record, rows_of
+from agent.sensing.samples import GpsSample, RangeSample
+from agent.sensing.timeline import TickInput
+from estimators.model import measurements
+from estimators.model.measurements import Kind
+from transport.messages.measurement_body import (
+    AccelerationRecord,
+    AnchorRangeRecord,
+    PositionRecord,
+    RangeRecord,
+    Record,
+    SpeedRecord,
+    VelocityRecord,
+)
+
+SLOTS = {1: 0, 2: 1, 3: 2}
+
+
+def fix(**changed: Any) -> GpsSample:
+    fields: dict[str, Any] = {
+        "t_s": 10.03, "position_m": (1.0, 2.0, -3.0), "horizontal_sigma_m": 0.5, "vertical_sigma_m": 0.8,
+        "ground_velocity_mps": (3.0, 4.0), "speed_mps": None, "speed_sigma_mps": 0.2, "fix_type": 3,
+    }  # fmt: skip
+    return GpsSample(**{**fields, **changed})
+
+
+def test_a_fix_becomes_rows_at_its_own_instant_with_the_receivers_accuracy() -> None:
+    records = gps_records(2, fix(), 0.1, SensorsTable())
+    rows = rows_of(records, SLOTS)
+    assert rows["tick"].tolist() == [100] * 5
+    assert rows["offset_s"] == pytest.approx([0.03] * 5)
+    assert rows["agent"].tolist() == [1] * 5
+    assert rows["kind"].tolist() == [Kind.POSITION] * 3 + [Kind.VELOCITY] * 2
+    assert rows["value"] == pytest.approx([1, 2, -3, 3, 4])
+    assert rows["variance"] == pytest.approx([0.25, 0.25, 0.64, 0.04, 0.04])
+    assert np.isinf(rows["half_width"]).all()
+
+
+def test_the_variance_of_wandering_fixes_is_raised_by_its_factor() -> None:
+    rows = rows_of(gps_records(2, fix(), 0.1, SensorsTable(gps_variance_factor=20.0))[:1], SLOTS)
+    assert rows["variance"] == pytest.approx([5.0, 5.0, 12.8])
+
+
+def test_configured_half_widths_set_variance_and_bound() -> None:
+    sensors = SensorsTable(gps_position_half_width_m=0.15, gps_speed_half_width_mps=0.08, uwb_bound_m=0.1)
+    records = gps_records(1, fix(ground_velocity_mps=None, speed_mps=5.0), 0.1, sensors)
+    rows = rows_of(records, SLOTS)
+    assert rows["kind"].tolist() == [Kind.POSITION] * 3 + [Kind.SPEED]
+    assert rows["variance"] == pytest.approx([0.0075] * 3 + [0.08**2 / 3])
+    assert rows["half_width"] == pytest.approx([0.15] * 3 + [0.08])
+    ranged = rows_of([range_record(RangeSample(10.07, 1, 3, 12.5, 0.3), 0.1, sensors)], SLOTS)
+    assert ranged["variance"] == pytest.approx([0.01 / 3])
+    assert (ranged["agent"][0], ranged["other"][0], ranged["value"][0]) == (0, 2, 12.5)
+    assert (ranged["tick"][0], ranged["offset_s"][0]) == (101, pytest.approx(-0.03))
+
+
+def test_a_flat_fix_says_nothing_of_the_height() -> None:
+    rows = rows_of(gps_records(1, fix(fix_type=2), 0.1, SensorsTable(gps_min_fix=2))[:1], SLOTS)
+    assert rows["z"].tolist() == [0, 0]
+
+
+def test_anchors_and_accelerations_keep_their_numbers() -> None:
+    anchored = rows_of([AnchorRangeRecord(3, 7, (1, 2, 3), 9.0, 0.04)], SLOTS)
+    assert (anchored["kind"][0], anchored["x"][0], anchored["agent"][0]) == (Kind.ANCHOR_RANGE, 1.0, 2)
+    closed = TickInput(7, (0.1, 0.2, 0.3), (0.01, 0.01, 0.01), 1.0, 10)
+    table = inputs_of([acceleration_record(2, closed)], SLOTS)
+    assert table["accel"].tolist() == [[0.1, 0.2, 0.3]]
+    assert (table["tick"][0], table["agent"][0]) == (7, 1)
+    with pytest.raises(TypeError, match="not a measurement"):
+        rows_of([acceleration_record(2, closed)], SLOTS)
+
+
+def test_rows_are_those_of_the_estimators_builders() -> None:
+    bounds = (0.5, 0.6, math.inf)
+    records: list[Record] = [
+        PositionRecord(2, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), bounds, 0.01),
+        VelocityRecord(3, 8, (4.0, 5.0, 6.0), (0.4, 0.5, 0.6), bounds, -0.01),
+        SpeedRecord(1, 9, 7.0, 0.7, 0.8, 0.02),
+        RangeRecord(1, 10, 3, 8.0, 0.8, 0.9, 0.03),
+        AnchorRangeRecord(3, 11, (1.0, 2.0, 3.0), 9.0, 0.9, 1.0, 0.04),
+    ]
+    built = [
+        measurements.position_rows(7, 1, (1, 2, 3), (0.1, 0.2, 0.3), offset_s=0.01, half_width_m=bounds),
+        measurements.velocity_rows(8, 2, (4, 5, 6), (0.4, 0.5, 0.6), offset_s=-0.01, half_width_mps=bounds),
+        measurements.speed_row(9, 0, 7.0, 0.7, offset_s=0.02, half_width_mps=0.8),
+        measurements.range_row(10, 0, 2, 8.0, 0.8, offset_s=0.03, half_width_m=0.9),
+        measurements.anchor_range_row(11, 2, (1, 2, 3), 9.0, 0.9, offset_s=0.04, half_width_m=1.0),
+    ]
+    assert rows_of(records, SLOTS).tolist() == np.concatenate(built).tolist()
+    assert rows_of([], SLOTS).dtype == measurements.ROW
+    pushes = inputs_of([AccelerationRecord(3, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))], SLOTS)
+    built_pushes = measurements.input_rows(7, 2, (1, 2, 3), (0.1, 0.2, 0.3))
+    for name in measurements.INPUT.names or ():
+        assert pushes[name].tolist() == built_pushes[name].tolist()
+    assert inputs_of([], SLOTS).dtype == measurements.INPUT
+
+
+def position(observer: int, tick: int, north_m: float = 1.0, offset_s: float = 0.0) -> PositionRecord:
+    return PositionRecord(observer, tick, (north_m, 0.0, 0.0), (0.1, 0.1, 0.1), offset_s=offset_s)
+
+
+def acceleration(observer: int, tick: int) -> AccelerationRecord:
+    return AccelerationRecord(observer, tick, (1.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+
+
+def line(make_config: Callable[..., FleetConfig], count: int = 4, *overrides: str) -> FleetConfig:
+    edges = [[i, i + 1] for i in range(1, count)]
+    return make_config(count, f"fleet.edges={edges}", *overrides)
+
+
+IDS = (1, 2, 3)
+"""All agents of a small fleet, located."""
+
+
+def test_each_record_is_handed_out_once_and_inputs_only_when_they_have_acted(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    store = RecordStore(make_config(), 1)
+    store.neighbourhood.hear(2, 5)
+    for _ in range(3):
+        store.add_own(position(1, 5))
+        store.add_heard([position(2, 5)], 5)
+        store.add_heard([acceleration(2, 5)], 5)
+        store.add_heard([position(2, 6)], 5)
+    rows, inputs = store.take(5, IDS, IDS)
+    assert (sorted(rows["agent"].tolist()), len(inputs)) == ([0, 0, 0, 1, 1, 1], 0)
+    rows, inputs = store.take(6, IDS, IDS)
+    assert (rows["tick"].tolist(), inputs["tick"].tolist()) == ([6] * 3, [5])
+    assert len(store.take(7, IDS, IDS)[0]) == 0
+    store.add_heard([position(2, 5)], 7)
+    assert len(store.take(8, IDS, IDS)[0]) == 0
+
+
+def test_a_record_is_taken_in_once_as_the_same_object_and_as_a_copy(make_config: Callable[..., FleetConfig]) -> None:
+    # GIVEN all hear all, WHEN a packet repeats a record, as the object of before and decoded anew, among new ones
+    store = RecordStore(make_config(), 1)
+    for other in (2, 3):
+        store.neighbourhood.hear(other, 6)
+    first, second, third = position(2, 5), position(2, 6), position(3, 6)
+    own = store.add_own(position(1, 6))
+    assert own is not None
+    assert store.add_heard([second, first], 6) == [second, first]
+    assert store.add_heard([second, position(2, 5), third, own, third], 6) == [third]
+    # THEN nothing is used or sent twice, and ours comes first
+    assert store.take(6, IDS, IDS)[0]["agent"].tolist() == [0] * 3 + [1] * 6 + [2] * 3
+    assert store.packet(6).records[0] is own
+    assert not store.refused
+    # AND a record long forgotten does not stand in the way of another
+    store.forget(200)
+    store.neighbourhood.hear(2, 200)
+    assert store.add_heard([position(2, 200)], 200)
+
+
+def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig]) -> None:
+    store = RecordStore(make_config(), 1)
+    store.neighbourhood.hear(2, 20)
+    store.take(20, IDS, IDS)
+    store.add_heard([position(2, 18, offset_s=0.04)], 20)
+    rows, _ = store.take(21, IDS, IDS)
+    assert rows["tick"].tolist() == [18] * 3
+    assert rows["offset_s"] == pytest.approx([0.04] * 3)
+
+
+def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[..., FleetConfig]) -> None:
+    store = RecordStore(make_config(), 1)
+    store.neighbourhood.hear(2, 100)
+    assert not store.add_heard([position(2, 100 - 65)], 100)
+    assert not store.add_heard([position(2, 103)], 100)
+    assert not store.add_heard([position(1, 100)], 100)
+    assert store.add_heard([position(2, 102)], 100)
+    assert dict(store.refused) == {"heard: too old": 1, "heard: of the future": 1}
+
+
+def test_packets_repeat_the_last_ticks_newest_first_and_relay_nothing_unasked(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    store = RecordStore(make_config(3, "transport.history_ticks=3", "estimator.share_inputs=none"), 1)
+    for tick in range(10):
+        store.add_own(position(1, tick))
+        store.add_own(acceleration(1, tick))
+        store.add_heard([position(2, tick)], tick)
+    packet = store.packet(8)
+    assert packet.tick == 8
+    assert [(record.observer, record.tick) for record in packet.records] == [(1, 8), (1, 7), (1, 6)]
+
+
+@pytest.mark.parametrize(
+    ("relay_hops", "share", "positions", "accelerations"),
+    [
+        (0, "none", [1, 2, 3], [2]),
+        (0, "neighbours", [1, 2, 3], [1, 2, 3]),
+        (1, "neighbours", [1, 2, 3, 4], [1, 2, 3]),
+        (1, "fleet", [1, 2, 3, 4], [1, 2, 3, 4, 5]),
+    ],
+)
+def test_whose_records_are_used_follows_hops_and_sharing(
+    make_config: Callable[..., FleetConfig],
+    relay_hops: int,
+    share: str,
+    positions: list[int],
+    accelerations: list[int],
+) -> None:
+    config = line(make_config, 5, f"estimator.relay_hops={relay_hops}", f"estimator.share_inputs={share}")
+    hood = RecordStore(config, 2).neighbourhood
+    assert [hood.hops(i) for i in range(1, 6)] == [1, 0, 1, 2, 3]
+    assert [i for i in range(1, 6) if hood.uses(position(i, 1))] == positions
+    assert [i for i in range(1, 6) if hood.uses(acceleration(i, 1))] == accelerations
+    assert [i for i in range(1, 6) if hood.sends(position(i, 1))] == [
+        i for i in range(1, 6) if (hood.hops(i) or 0) <= relay_hops
+    ]
+
+
+def test_our_own_numbers_are_those_that_others_get(make_config: Callable[..., FleetConfig]) -> None:
+    store = RecordStore(make_config(), 1)
+    rounded = store.add_own(position(1, 5, north_m=1 / 3))
+    assert isinstance(rounded, PositionRecord)
+    assert rounded.position_m[0] == float(np.float32(1 / 3))
+    assert store.take(5, IDS, IDS)[0]["value"][0] == rounded.position_m[0]
+    assert store.add_own(position(1, 6, north_m=1e7)) is None
+    assert store.refused["own: out of range"] == 1
+
+
+@given(st.floats(0, 1e7), st.floats(-1, 1))
+def test_tick_and_offset_add_up_to_the_instant(t_s: float, sign: float) -> None:
+    record = range_record(RangeSample(t_s, 1, 2, 5.0, 0.1), 0.1, SensorsTable())
+    assert record.tick * 0.1 + record.offset_s == pytest.approx(t_s, abs=1e-6)
+    assert abs(record.offset_s) <= 0.05 + 1e-6
+
+
+def test_memory_stays_bounded(make_config: Callable[..., FleetConfig]) -> None:
+    store = RecordStore(make_config(), 1)
+    for tick in range(1000):
+        store.add_own(position(1, tick))
+        store.add_heard([RangeRecord(2, tick, 3, 4.0, 0.1)], tick)
+        store.add_heard([VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
+        store.take(tick, IDS, IDS)
+    assert len(store._seen) <= 66
+    assert len(store._to_send) <= 66
+
+
+def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_the_members(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    # GIVEN a fix of 3 and ranges 1-3 and 1-2, WHEN 2 is no member and 3 is not located yet
+    store = RecordStore(make_config(3, "estimator.window=4"), 1)
+    store.neighbourhood.hear(3, 10)
+    store.add_heard([position(3, 10)], 10)
+    store.add_own(RangeRecord(1, 10, 3, 4.0, 0.1))
+    store.add_own(RangeRecord(1, 10, 2, 5.0, 0.1))
+    store.add_own(acceleration(1, 9))
+    store.add_heard([acceleration(3, 9)], 10)
+    rows, inputs = store.take(10, (1,), (1,))
+    assert (len(rows), inputs["agent"].tolist()) == (0, [0])
+    # THEN what names 3 comes once it is, with its slot, and what names 2 stays
+    rows, inputs = store.take(11, (1, 3), (1, 3))
+    assert sorted(zip(rows["agent"].tolist(), rows["other"].tolist(), strict=True)) == [(0, 1), *[(1, -1)] * 3]
+    assert inputs["agent"].tolist() == [1]
+    assert store.take(14, IDS, (1, 3))[0].size == 0
+    # AND after a window's length it is let go and counted
+    assert store.take(15, IDS, (1, 3))[0].size == 0
+    assert store.take(16, IDS, IDS)[0].size == 0
+    assert store.refused["not located"] == 1
+
+
+def test_without_edges_a_neighbour_is_who_was_heard_of_late(make_config: Callable[..., FleetConfig]) -> None:
+    hood = RecordStore(make_config(3, "transport.neighbour_timeout_s=2.0", "estimator.relay_hops=1"), 1).neighbourhood
+    assert [hood.hops(i) for i in IDS] == [0, 2, 2]
+    hood.hear(2, 100)
+    assert [hood.hops(i) for i in IDS] == [0, 1, 2]
+    assert hood.sends(position(2, 100))
+    assert not hood.sends(position(3, 100))
+    hood.hear(3, 121)
+    assert [hood.hops(i) for i in IDS] == [0, 2, 1]

@@ -1,0 +1,245 @@
+"""The autopilot session in virtual time, against an autopilot that speaks real MAVLink."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+from agent.config.tables import FleetConfig
+from agent.mavlink.codec import Encoder, mavlink
+from agent.mavlink.session import AutopilotSession, LinkState
+from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, Sample
+
+STEP_S = 0.01
+DELAY_S = 0.001
+PX4, ARDUPILOT = mavlink.MAV_AUTOPILOT_PX4, mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA
+HIGHRES, RAW, QUATERNION = 105, 27, 31
+
+
+@dataclass
+class Bench:
+    """A session and an autopilot on a wire with a delay of 1 ms each way."""
+
+    session: AutopilotSession
+    autopilot: Any
+    now_s: float = 100.0
+    samples: list[Sample] = field(default_factory=list)
+    silent: bool = False
+
+    def run(self, duration_s: float) -> None:
+        for _ in range(round(duration_s / STEP_S)):
+            self.now_s += STEP_S
+            for frame in self.autopilot.step(self.now_s):
+                if not self.silent:
+                    self.samples += self.session.receive(frame, self.now_s + DELAY_S)
+            for frame in self.session.to_send(self.now_s + DELAY_S):
+                self.autopilot.receive(frame, self.now_s + 2 * DELAY_S)
+                for answer in self.autopilot.step(self.now_s + 2 * DELAY_S):
+                    if not self.silent:
+                        self.samples += self.session.receive(answer, self.now_s + 3 * DELAY_S)
+
+    def of(self, kind: type) -> list[Any]:
+        return [sample for sample in self.samples if isinstance(sample, kind)]
+
+
+@pytest.fixture
+def bench(make_config: Callable[..., FleetConfig], virtual_autopilot: type[Any]) -> Callable[..., Bench]:
+    def make(*overrides: str, **autopilot: Any) -> Bench:
+        config = make_config(3, *overrides)
+        return Bench(AutopilotSession(config, 1, datagrams=True), virtual_autopilot(**autopilot))
+
+    return make
+
+
+@pytest.mark.parametrize("flavour", [PX4, ARDUPILOT])
+def test_an_autopilot_is_found_asked_and_understood(bench: Callable[..., Bench], flavour: int) -> None:
+    b = bench(autopilot=flavour)
+    assert b.session.state is LinkState.SEARCHING
+    b.run(10)
+    assert b.session.state is LinkState.CONNECTED
+    assert b.session.autopilot is not None
+    assert b.session.autopilot.flavour == {PX4: "px4", ARDUPILOT: "ardupilot"}[flavour]
+    assert [message_id for message_id, _ in b.autopilot.commands] == [HIGHRES, QUATERNION, 24, 2, 32]
+    assert len(b.of(ImuSample)) == pytest.approx(990, abs=15)
+    assert len(b.of(AttitudeSample)) == pytest.approx(495, abs=10)
+    assert len(b.of(GpsSample)) == pytest.approx(98, abs=5)
+    rate = b.session.rates.streams[HIGHRES].rate_hz
+    assert rate == pytest.approx(100, rel=0.05)
+
+
+def test_samples_carry_fleet_time_of_the_boot_stamps(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.session.fleet_offset_s = -50.0
+    b.run(5)
+    last = b.of(ImuSample)[-1]
+    assert last.t_s == pytest.approx(b.now_s - 50.0, abs=2e-3)
+
+
+def test_our_heartbeat_says_who_and_how_we_are_and_stops_when_at_fault(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(3)
+    beats = b.autopilot.received["HEARTBEAT"]
+    assert len(beats) == 3
+    assert (beats[0].get_srcSystem(), beats[0].get_srcComponent()) == (1, 197)
+    assert (beats[0].type, beats[0].autopilot) == (18, 8)
+    b.session.system_status = None
+    b.run(3)
+    assert len(b.autopilot.received["HEARTBEAT"]) == 3
+
+
+def test_heartbeats_of_others_are_not_autopilots(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    for system, component, kind, autopilot in [
+        (255, 190, 6, 8),
+        (1, 191, 18, 8),
+        (1, 154, 26, 3),
+        (2, 1, 2, 12),
+    ]:
+        frame = Encoder(system, component).encode(mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3))
+        b.session.receive(frame, 100.0)
+    assert b.session.state is LinkState.SEARCHING
+    assert b.session.ignored["heartbeat: other system"] == 1
+
+
+def test_another_flavour_than_configured_is_refused_by_name(bench: Callable[..., Bench]) -> None:
+    b = bench("agents.1.autopilot=px4", autopilot=ARDUPILOT)
+    b.run(3)
+    assert b.session.state is LinkState.SEARCHING
+    assert b.session.ignored["heartbeat: ardupilot instead of px4"] == 3
+
+
+def test_raw_imu_is_asked_for_where_highres_imu_is_refused(bench: Callable[..., Bench]) -> None:
+    b = bench(autopilot=ARDUPILOT, refuses=(HIGHRES,))
+    b.run(5)
+    assert RAW in b.autopilot.rates
+    assert b.of(ImuSample)[-1].specific_force_mps2[2] == pytest.approx(-9.80665)
+    px4 = bench(refuses=(HIGHRES,))
+    px4.run(5)
+    assert RAW not in px4.autopilot.rates
+
+
+def test_requests_without_answer_are_repeated_three_times_and_then_the_next_is_tried(
+    bench: Callable[..., Bench],
+) -> None:
+    b = bench(deaf=True)
+    b.run(4)
+    asked = [int(command.param1) for command in b.autopilot.received["COMMAND_LONG"]]
+    assert asked == [HIGHRES] * 3 + [QUATERNION] * 3 + [24] * 2
+
+
+def test_a_stream_that_someone_slowed_is_asked_for_again_but_not_at_once(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(5)
+    b.autopilot.rates[HIGHRES] = 10.0
+    b.run(20)
+    asked = [message_id for message_id, _ in b.autopilot.commands]
+    assert asked.count(HIGHRES) == 1
+    assert HIGHRES in b.session.rates.slow()
+    b.run(10)
+    assert [message_id for message_id, _ in b.autopilot.commands].count(HIGHRES) == 2
+    assert b.autopilot.rates[HIGHRES] == pytest.approx(100.0)
+
+
+def test_a_lost_autopilot_is_noticed_and_taken_back(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(5)
+    b.silent = True
+    b.run(1.9)
+    assert b.session.state is LinkState.CONNECTED
+    b.run(2.2)
+    assert b.session.state is LinkState.LOST
+    b.silent = False
+    asked = len(b.autopilot.commands)
+    b.run(2)
+    assert b.session.state is LinkState.CONNECTED
+    assert len(b.autopilot.commands) > asked  # it may have restarted meanwhile
+
+
+def test_a_reboot_is_seen_and_times_are_right_again(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(8)
+    b.autopilot.boot_s = b.now_s
+    b.autopilot.rates = {2: 1.0}
+    b.samples.clear()
+    b.run(5)
+    assert b.session.reboots == 1
+    assert b.of(ImuSample)[-1].t_s == pytest.approx(b.now_s, abs=2e-3)
+    assert all(abs(sample.t_s - b.now_s) < 6 for sample in b.samples)
+
+
+def test_timesync_requests_are_answered_with_the_monotonic_clock(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(2)
+    frame = b.autopilot.encoder.encode(mavlink.MAVLink_timesync_message(0, 777))
+    b.session.receive(frame, 123.456)
+    b.run(0.02)
+    answers = [m for m in b.autopilot.received["TIMESYNC"] if m.ts1 == 777]
+    assert [m.tc1 for m in answers] == [123_456_000_000]
+
+
+def test_a_second_responder_silences_ours(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(2)
+    other = Encoder(1, 191).encode(mavlink.MAVLink_timesync_message(5, 6))
+    b.session.receive(other, b.now_s)
+    b.session.receive(b.autopilot.encoder.encode(mavlink.MAVLink_timesync_message(0, 777)), b.now_s)
+    b.run(0.02)
+    assert not [m for m in b.autopilot.received["TIMESYNC"] if m.ts1 == 777]
+    assert b.session.ignored["other source"] == 1
+
+
+def test_without_timesync_answers_the_fallback_serves(bench: Callable[..., Bench]) -> None:
+    b = bench(answers_timesync=False)
+    b.run(5)
+    assert not b.session.clock.synchronised
+    assert b.of(ImuSample)[-1].t_s == pytest.approx(b.now_s, abs=5e-3)
+
+
+def test_messages_of_other_components_are_never_samples(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(2)
+    b.samples.clear()
+    frame = Encoder(1, 200).encode(mavlink.MAVLink_attitude_quaternion_message(12_000, 1, 0, 0, 0, 0, 0, 0))
+    assert b.session.receive(frame, b.now_s) == []
+
+
+def test_fuzzed_datagrams_are_all_accounted_for_and_change_nothing(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(3)
+    rng = random.Random(5)
+    template = b.autopilot.encoder.encode(mavlink.MAVLink_attitude_quaternion_message(3000, 1, 0, 0, 0, 0, 0, 0))
+    before = (b.session.decoder.received, b.session.reboots, b.session.state)
+    b.samples.clear()
+    for _ in range(20_000):
+        data = bytearray(template)
+        for _ in range(rng.randint(1, 4)):
+            data[rng.randrange(len(data))] ^= rng.randint(1, 255)
+        b.samples += b.session.receive(bytes(data[: rng.randint(1, len(data))]), b.now_s)
+        b.samples += b.session.receive(rng.randbytes(rng.randint(1, 64)), b.now_s)
+    accepted = b.session.decoder.received - before[0]
+    assert accepted <= 5  # a 16-bit checksum lets one in 65536 through
+    assert len(b.samples) <= accepted
+    assert b.session.decoder.bad.total() >= 40_000 - accepted
+    assert len(b.session.decoder.bad) <= 10
+    assert (b.session.reboots, b.session.state) == before[1:]
+    b.run(1)
+    assert len(b.of(ImuSample)) == pytest.approx(100, abs=2)
+
+
+def test_frames_of_other_systems_are_not_heard_as_the_autopilot(bench: Callable[..., Bench]) -> None:
+    # GIVEN a connected autopilot, WHEN sound frames of another system come on the same link
+    b = bench()
+    b.run(1)
+    heard = b.session.heard
+    assert heard > 0
+    stranger = Encoder(77, 1)
+    b.session.receive(stranger.encode(mavlink.MAVLink_heartbeat_message(2, PX4, 0, 0, 4, 3)), b.now_s)
+    b.session.receive(stranger.encode(mavlink.MAVLink_attitude_quaternion_message(1, 1, 0, 0, 0, 0, 0, 0)), b.now_s)
+    # THEN the link has no reason to answer them instead
+    assert b.session.heard == heard
+    b.run(1)
+    assert b.session.heard > heard

@@ -1,0 +1,226 @@
+"""Real pymavlink messages of both flavours through the adapter: units, invalid markers, traps."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from agent.config.tables import FleetConfig, SensorsTable
+from agent.mavlink.codec import Decoder, Encoder, mavlink
+from agent.mavlink.sample_adapter import SampleAdapter
+from agent.sensing.frames import FleetFrame, rotated
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+
+FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
+EPOCH_UNIX_S = 1_767_225_600.0
+ARRIVAL_S = 500.0
+BOOT_OFFSET_S = 400.0
+
+
+def adapter(ardupilot: bool = False, **sensors: Any) -> SampleAdapter:
+    made = SampleAdapter(FRAME, SensorsTable(**sensors), EPOCH_UNIX_S, lambda boot_s, _: boot_s + BOOT_OFFSET_S)
+    made.flavour = "ardupilot" if ardupilot else "px4"
+    return made
+
+
+def through_the_wire(message: Any) -> Any:
+    return Decoder(datagrams=True).feed(Encoder(1, 1).encode(message))[0]
+
+
+def convert(made: SampleAdapter, message: Any, arrival_s: float = ARRIVAL_S) -> Any:
+    return made.convert(through_the_wire(message), arrival_s)
+
+
+def highres(time_usec: int = 99_990_000, fields: int = 0x1FFF, number: int = 0, x: float = 0.5) -> Any:
+    return mavlink.MAVLink_highres_imu_message(
+        time_usec, x, -0.25, -9.75, 0.1, -0.2, 0.3, 0.2, 0, 0.4, 950, 0, 500, 35, fields, number
+    )
+
+
+def raw_imu(time_usec: int = 99_990_000) -> Any:
+    return mavlink.MAVLink_raw_imu_message(time_usec, 100, -50, -1000, 10, -20, 30, 0, 0, 0, 0, 0)
+
+
+def gps(**changed: Any) -> Any:
+    fields: dict[str, Any] = {
+        "time_usec": 99_900_000, "fix_type": 3, "lat": 470001000, "lon": 80002000, "alt": 412_500, "eph": 80,
+        "epv": 120, "vel": 500, "cog": 9000, "satellites_visible": 14, "alt_ellipsoid": 460_000, "h_acc": 300,
+        "v_acc": 500, "vel_acc": 200, "hdg_acc": 0, "yaw": 0,
+    }  # fmt: skip
+    return mavlink.MAVLink_gps_raw_int_message(**{**fields, **changed})
+
+
+@pytest.mark.parametrize("force_mps2", [1e30, -1000.5])
+def test_what_no_imu_can_measure_is_no_sample(force_mps2: float) -> None:
+    made = adapter()
+    assert convert(made, highres(x=force_mps2)) is None
+    assert made.skipped == {"imu: out of range": 1}
+    assert convert(made, highres(x=-999.5)) is not None
+
+
+def test_highres_imu_is_si_already() -> None:
+    sample = convert(adapter(), highres())
+    assert isinstance(sample, ImuSample)
+    assert sample.t_s == pytest.approx(499.99)
+    assert sample.specific_force_mps2 == pytest.approx((0.5, -0.25, -9.75))
+    assert sample.gyro_radps == pytest.approx((0.1, -0.2, 0.3))
+
+
+def test_raw_imu_of_ardupilot_is_in_milli_g_and_millirad() -> None:
+    sample = convert(adapter(ardupilot=True), raw_imu())
+    assert sample.specific_force_mps2 == pytest.approx((0.980665, -0.4903325, -9.80665))
+    assert sample.gyro_radps == pytest.approx((0.01, -0.02, 0.03))
+
+
+def test_raw_imu_of_others_is_unscaled_and_refused() -> None:
+    made = adapter(ardupilot=False)
+    assert convert(made, raw_imu()) is None
+    assert made.skipped["imu: RAW_IMU unscaled"] == 1
+
+
+def test_raw_imu_serves_only_while_highres_imu_is_silent() -> None:
+    made = adapter(ardupilot=True)
+    assert convert(made, highres()) is not None
+    assert convert(made, raw_imu()) is None
+    assert convert(made, raw_imu(101_000_000), ARRIVAL_S + 1.1) is not None
+
+
+def test_second_imus_and_frames_without_new_data_are_left_out() -> None:
+    made = adapter()
+    assert convert(made, highres(number=1)) is None
+    assert convert(made, highres(fields=0x1FC0)) is None
+    assert convert(made, highres(x=math.nan)) is None
+    assert dict(made.skipped) == {"imu: not the first one": 1, "imu: nothing new": 1, "imu: not finite": 1}
+
+
+def test_attitude_quaternion_is_preferred_and_its_display_offset_ignored() -> None:
+    made = adapter()
+    turned = mavlink.MAVLink_attitude_quaternion_message(
+        99_990, math.cos(0.5), 0, 0, math.sin(0.5), 0, 0, 0, [0, 1, 0, 0]
+    )
+    sample = convert(made, turned)
+    assert isinstance(sample, AttitudeSample)
+    assert rotated(sample.quaternion, (1, 0, 0)) == pytest.approx((math.cos(1), math.sin(1), 0), abs=1e-6)
+    euler = mavlink.MAVLink_attitude_message(99_990, 0.0, 0.0, 0.0, 0, 0, 0)
+    assert convert(made, euler) is None
+    assert isinstance(
+        convert(made, mavlink.MAVLink_attitude_message(101_000, 0, 0, 0, 0, 0, 0), 501.1), AttitudeSample
+    )
+    assert convert(made, mavlink.MAVLink_attitude_quaternion_message(99_990, 0, 0, 0, 0, 0, 0, 0)) is None
+    assert made.skipped["attitude: no unit quaternion"] == 1
+
+
+def test_gps_position_accuracies_and_horizontal_velocity() -> None:
+    sample = convert(adapter(), gps())
+    assert isinstance(sample, GpsSample)
+    assert sample.t_s == pytest.approx(499.9)
+    assert sample.position_m == pytest.approx(FRAME.ned(47.0001, 8.0002, 412.5), abs=1e-6)
+    assert sample.position_m[2] == pytest.approx(-12.5, abs=0.01)
+    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == pytest.approx((0.3, 0.5))
+    assert sample.ground_velocity_mps == pytest.approx((0.0, 5.0), abs=1e-9)
+    assert sample.speed_mps is None
+    assert sample.speed_sigma_mps == pytest.approx(0.2)
+
+
+def test_hdop_times_hundred_is_not_metres_and_zero_accuracy_is_unknown() -> None:
+    sample = convert(adapter(), gps(h_acc=0, v_acc=0, vel_acc=0, eph=80, epv=120))
+    assert (sample.horizontal_sigma_m, sample.vertical_sigma_m) == pytest.approx((0.8 * 2.5, 1.2 * 2.5))
+    assert sample.speed_sigma_mps == pytest.approx(0.3)
+    assert convert(adapter(), gps(h_acc=0, eph=20)).horizontal_sigma_m == pytest.approx(0.5 * 2.5)
+    assert convert(adapter(), gps(h_acc=1)).horizontal_sigma_m == pytest.approx(0.02)
+    made = adapter()
+    assert convert(made, gps(h_acc=0, eph=65535)) is None
+    assert made.skipped["gps: no accuracy"] == 1
+
+
+def test_the_configured_meaning_of_speed() -> None:
+    norm = convert(adapter(gps_speed="norm"), gps())
+    assert (norm.ground_velocity_mps, norm.speed_mps) == (None, 5.0)
+    off = convert(adapter(gps_speed="off"), gps())
+    assert (off.ground_velocity_mps, off.speed_mps) == (None, None)
+    for unknown in ({"vel": 65535}, {"cog": 65535}):
+        sample = convert(adapter(), gps(**unknown))
+        assert (sample.ground_velocity_mps, sample.speed_mps) == (None, None)
+
+
+@pytest.mark.parametrize("fix_type", [0, 1, 2, 9])
+def test_without_a_fix_there_is_no_sample(fix_type: int) -> None:
+    made = adapter()
+    assert convert(made, gps(fix_type=fix_type)) is None
+    assert made.fix_type == fix_type
+    assert made.skipped["gps: no fix"] == 1
+
+
+def test_a_lost_receiver_of_px4_gives_no_sample() -> None:
+    lost = gps(fix_type=0, eph=65535, epv=65535, vel=65535, cog=65535, satellites_visible=255)
+    assert convert(adapter(), lost) is None
+
+
+def test_a_fix_sent_again_is_used_once() -> None:
+    made = adapter()
+    assert convert(made, gps()) is not None
+    assert convert(made, gps()) is None
+    assert made.skipped["gps: sent again"] == 1
+    assert convert(made, gps(time_usec=100_000_000)) is not None
+
+
+def test_gps_time_zero_is_arrival_and_unix_time_is_understood() -> None:
+    made = adapter()
+    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S)
+    assert convert(made, gps(time_usec=0)).t_s == pytest.approx(ARRIVAL_S)  # time 0 is no identity
+    unix = round((EPOCH_UNIX_S + 499.5) * 1e6)
+    assert convert(made, gps(time_usec=unix)).t_s == pytest.approx(499.5, abs=1e-5)
+
+
+def test_heights_follow_the_fleets_origin() -> None:
+    ellipsoid = FleetFrame(47.0, 8.0, 448.0, msl=False)
+    made = SampleAdapter(ellipsoid, SensorsTable(), EPOCH_UNIX_S, lambda boot_s, _: boot_s + BOOT_OFFSET_S)
+    assert convert(made, gps()).position_m[2] == pytest.approx(-12.0, abs=0.01)
+    assert convert(made, gps(alt_ellipsoid=0, time_usec=1)) is None
+    assert made.skipped["gps: no height of the fleet's sort"] == 1
+
+
+@pytest.mark.parametrize("place", [{"lat": 0, "lon": 0}, {"lat": 900_000_001}, {"lon": -1_800_000_001}])
+def test_places_that_do_not_exist_are_refused(place: dict[str, int]) -> None:
+    made = adapter()
+    assert convert(made, gps(**place)) is None
+    assert made.skipped["gps: no position"] == 1
+
+
+def test_stamps_that_cannot_be_true_are_counted() -> None:
+    made = adapter()
+    assert convert(made, highres(time_usec=90_000_000)) is None
+    assert convert(made, highres(time_usec=101_000_000)) is None
+    assert made.skipped["imu: wrong time"] == 2
+    blind = SampleAdapter(FRAME, SensorsTable(), EPOCH_UNIX_S, lambda boot_s, _: None)
+    assert convert(blind, highres()) is None
+    assert blind.skipped["imu: clock unknown"] == 1
+
+
+def test_the_autopilots_own_position_is_never_a_measurement() -> None:
+    made = adapter()
+    local = mavlink.MAVLink_local_position_ned_message(99_990, 1, 2, 3, 4, 5, 6)
+    assert isinstance(convert(made, local), AutopilotEstimate)
+    for message in (
+        mavlink.MAVLink_global_position_int_message(99_990, 470000000, 80000000, 1, 2, 3, 4, 5, 6),
+        mavlink.MAVLink_gps2_raw_message(99_900_000, 3, 470001000, 80002000, 412_500, 80, 120, 5, 0, 9, 0, 0),
+        mavlink.MAVLink_vfr_hud_message(1, 2, 3, 4, 5, 6),
+    ):
+        assert convert(made, message) is None
+
+
+@given(st.integers(-32768, 32767), st.integers(-32768, 32767), st.integers(-32768, 32767))
+def test_raw_imu_scales_every_integer(x: int, y: int, z: int) -> None:
+    message = mavlink.MAVLink_raw_imu_message(99_990_000, x, y, z, x, y, z, 0, 0, 0, 0, 0)
+    sample = convert(adapter(ardupilot=True), message)
+    assert sample.specific_force_mps2 == pytest.approx((x * 9.80665e-3, y * 9.80665e-3, z * 9.80665e-3))
+    assert sample.gyro_radps == pytest.approx((x * 1e-3, y * 1e-3, z * 1e-3))
+
+
+def test_the_frame_comes_from_the_configuration(make_config: Callable[..., FleetConfig]) -> None:
+    assert FleetFrame.of(make_config()) == FRAME

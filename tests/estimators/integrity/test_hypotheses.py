@@ -1,0 +1,153 @@
+"""The Gaussian mixture over one drone's state."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from estimators.integrity.hypotheses import (
+    MOST,
+    Mixture,
+    correct_linear,
+    correct_range,
+    is_sound,
+    on_sphere,
+    predict,
+    reduce,
+    split,
+)
+from estimators.model.motion import input_matrix, transition_matrix
+from tests.support.builders import random_covariance
+
+NOWHERE = np.zeros((6, 6))
+
+
+def moments(mixture: Mixture) -> tuple[np.ndarray, np.ndarray]:
+    mean = mixture.weights @ mixture.means
+    return mean, mixture.second_moment(mean)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1))
+def test_splitting_and_merging_keep_the_moments(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(1, 6))
+    mixture = Mixture(
+        rng.normal(size=count),
+        rng.normal(size=(count, 6)) * 3.0,
+        np.array([random_covariance(rng, 6, 2.0) for _ in range(count)]),
+    )
+    before = moments(mixture)
+    split(mixture, rng.normal(size=3) * 10.0, 0.8, rng.normal(size=3))
+    assert count <= len(mixture.log_weights) <= MOST
+    assert is_sound(mixture)
+    assert (np.linalg.eigvalsh(mixture.covariances) > 0).all()
+    for now, then in zip(moments(mixture), before, strict=True):
+        assert now == pytest.approx(then, abs=1e-9)
+    pruned = mixture.weights.min() < 1e-6
+    reduce(mixture)
+    assert mixture.weights.sum() == pytest.approx(1.0)
+    if not pruned:
+        for now, then in zip(moments(mixture), before, strict=True):
+            assert now == pytest.approx(then, abs=1e-6)
+
+
+def test_one_component_is_a_kalman_filter() -> None:
+    rng = np.random.default_rng(2)
+    mean, covariance = rng.normal(size=6), random_covariance(rng, 6)
+    accel, noise = rng.normal(size=3), np.array([0.1, 0.2, 0.3])
+    slope, value, variance = rng.normal(size=6), 1.7, 0.3
+    mixture = Mixture.single(mean, covariance)
+    predict(mixture, accel, noise, 0.1)
+    a, b = transition_matrix(1, 0.1), input_matrix(1, 0.1)
+    mean, covariance = a @ mean + b @ accel, a @ covariance @ a.T + b @ np.diag(noise) @ b.T
+    correct_linear(mixture, slope, value, variance)
+    total = slope @ covariance @ slope + variance
+    gain = covariance @ slope / total
+    innovation = value - slope @ mean
+    assert mixture.means[0] == pytest.approx(mean + gain * innovation)
+    assert mixture.covariances[0] == pytest.approx(covariance - np.outer(gain, slope) @ covariance)
+    # THEN the evidence is the density of the datum, up to a constant
+    assert mixture.evidence == pytest.approx(-0.5 * (innovation**2 / total + np.log(total)))
+
+
+def test_a_range_from_far_is_a_linear_row() -> None:
+    # GIVEN a body so far away that its range is linear in the own state, at an instant off the tick
+    rng = np.random.default_rng(4)
+    mean, covariance = rng.normal(size=6), random_covariance(rng, 6)
+    unit = np.array([2.0, -1.0, 2.0]) / 3.0
+    place = np.concatenate([-1e7 * unit, [0.5, 0.2, -0.1]])
+    spread = random_covariance(rng, 6, 0.2)
+    lever = np.concatenate([unit, 0.05 * unit])
+    one, other = Mixture.single(mean, covariance), Mixture.single(mean, covariance)
+    correct_range(one, place, spread, 1e7 + 0.4, 0.1, 0.05)
+    correct_linear(other, lever, lever @ place + 1e7 + 0.4, 0.1 + lever @ spread @ lever)
+    assert one.means == pytest.approx(other.means, abs=1e-5)
+    assert one.covariances == pytest.approx(other.covariances, abs=1e-5)
+
+
+def test_the_slope_of_a_range_is_its_numeric_derivative() -> None:
+    rng = np.random.default_rng(7)
+    state, place, offset = rng.normal(size=6) * 3.0, rng.normal(size=6) * 3.0, -0.07
+
+    def distance(x: np.ndarray) -> float:
+        return float(np.linalg.norm(x[:3] + offset * x[3:] - place[:3] - offset * place[3:]))
+
+    steps = 1e-5 * np.eye(6)
+    numeric = np.array([(distance(state + step) - distance(state - step)) / 2e-5 for step in steps])
+    # GIVEN a state known so well that a correction moves it along the slope alone, by covariance times innovation
+    small = 1e-8
+    mixture = Mixture.single(state, small * np.eye(6))
+    correct_range(mixture, place, NOWHERE, distance(state) + 1.0, 1.0, offset)
+    assert (mixture.means[0] - state) / small == pytest.approx(numeric, abs=1e-6)
+
+
+def test_three_ranges_leave_two_places_and_the_prior_weighs_them() -> None:
+    # GIVEN a wide belief and three bodies in a plane; the truth above it
+    truth = np.array([1.0, 2.0, -6.0, 0.0, 0.0, 0.0])
+    places = np.array([[8.0, 0.0, 0.0], [-6.0, 7.0, 0.0], [-5.0, -8.0, 0.0]])
+    ranges = np.linalg.norm(truth[:3] - places, axis=-1)
+    start, wide = np.array([0.0, 0.0, -1.0, 0.0, 0.0, 0.0]), np.diag([400.0, 400.0, 400.0, 1.0, 1.0, 1.0])
+    order = np.argsort(ranges)
+    first = order[0]
+    mixture = on_sphere(start, wide, places[first], ranges[first], 0.01, places[order[1]] - places[first])
+    # WHEN ten ticks of the same ranges are used
+    for _ in range(10):
+        predict(mixture, np.zeros(3), np.full(3, 1e-4), 0.1)
+        split(mixture, places[first], 1.0, places[order[1]] - places[first])
+        for at in order:
+            correct_range(mixture, np.concatenate([places[at], np.zeros(3)]), NOWHERE, ranges[at], 0.01)
+        reduce(mixture)
+    # THEN the truth and its mirror image are left, about as likely as each other
+    sides = [np.abs(mixture.means[:, :3] - [1.0, 2.0, z]).max(axis=-1) < 0.5 for z in (-6.0, 6.0)]
+    held = [float(mixture.weights[side].sum()) for side in sides]
+    assert sum(held) > 0.98
+    assert min(held) > 0.1
+
+
+def test_it_does_not_depend_on_north() -> None:
+    rng = np.random.default_rng(6)
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    centre, other = np.array([5.0, 1.0, -3.0]), np.array([-4.0, 6.0, 2.0])
+    mean, covariance = rng.normal(size=6), 9.0 * np.eye(6)
+
+    def run(rotation: np.ndarray) -> Mixture:
+        full = np.kron(np.eye(2), rotation)
+        mixture = on_sphere(
+            full @ mean, full @ covariance @ full.T, rotation @ centre, 7.0, 0.01, rotation @ (other - centre)
+        )
+        split(mixture, rotation @ centre, 1.0, rotation @ (other - centre))
+        correct_range(mixture, full @ np.r_[other, 0, 0, 0], NOWHERE, 8.0, 0.01)
+        reduce(mixture)
+        return mixture
+
+    straight, turned = run(np.eye(3)), run(turn)
+    full = np.kron(np.eye(2), turn)
+    assert len(straight.weights) == len(turned.weights)
+    assert turned.weights @ turned.means == pytest.approx(full @ (straight.weights @ straight.means), abs=1e-6)
+    about = straight.means[0]
+    expected = full @ straight.second_moment(about) @ full.T
+    assert turned.second_moment(full @ about) == pytest.approx(expected, abs=1e-5)

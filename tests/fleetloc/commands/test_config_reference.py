@@ -1,0 +1,25 @@
+"""The configuration reference is that of the code."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from agent.config.tables import FleetConfig
+from fleetloc.config_reference import reference
+
+PAGE = Path(__file__).parents[3] / "docs" / "configuration.md"
+
+
+def test_the_page_is_what_the_code_says() -> None:
+    assert PAGE.read_text(encoding="utf-8") == reference(), "the configuration's tables have changed: make docs"
+
+
+def test_every_table_and_every_key_of_it_is_there() -> None:
+    page = reference()
+    for field in msgspec.structs.fields(FleetConfig):
+        assert f"[{field.name}]" in page
+    for key in ("period_s", "gps_speed_half_width_mps", "center_m", "lat_deg", "neighbour_timeout_s"):
+        assert f"| `{key}` |" in page
+    assert '`[[sim.paths]]`, kind = "circle"' in page

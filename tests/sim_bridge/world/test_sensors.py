@@ -1,0 +1,210 @@
+"""What the simulated sensors say against what is true."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agent.sensing.frames import FleetFrame
+from sim_bridge.world import quaternions
+from sim_bridge.world.guidance import Waypoints
+from sim_bridge.world.noise import PAPER, REALISTIC, GaussMarkov
+from sim_bridge.world.scenario import GpsJump, Interval, Vehicle
+from sim_bridge.world.simulation import Simulation
+
+THREE = tuple(Vehicle(agent, "px4", agent) for agent in (1, 2, 3))
+
+
+def ned_of(frame: FleetFrame, fix) -> np.ndarray:
+    return np.array(frame.ned(fix.lat_deg, fix.lon_deg, fix.alt_msl_m if frame.msl else fix.alt_ellipsoid_m))
+
+
+def each_step(simulation: Simulation, seconds: float):
+    for _ in range(round(seconds / simulation.world.step_s)):
+        simulation.world.step()
+        yield simulation.world
+
+
+def test_paper_imu_noise_is_one_uniform_draw_per_tick_in_ned(make_scenario):
+    # GIVEN the paper's profile, on a run that starts on a tick
+    simulation = Simulation(make_scenario(*THREE, seed=5), 0.0)
+    errors = []
+    for world in each_step(simulation, 6.0):
+        for slot in range(3):
+            body = simulation.sensors.imu(slot).accel_mps2
+            ned = quaternions.rotate(world.attitude()[slot : slot + 1], body[None])[0]
+            errors.append(ned - world.specific_force_ned()[slot])
+    # WHEN the samples are turned back to NED THEN the error is constant within each tick of 0.1 s
+    by_tick = np.array(errors).reshape(60, 20, 3, 3)
+    np.testing.assert_allclose(by_tick, by_tick[:, :1].repeat(20, axis=1), atol=1e-12)
+    draws = by_tick[:, 0].reshape(-1)
+    assert np.abs(draws).max() <= 0.1
+    # and it fills the interval, with the variance of a uniform noise
+    assert draws.std() == pytest.approx(0.1 / math.sqrt(3.0), rel=0.08)
+    assert len(np.unique(draws)) == draws.size
+
+
+@pytest.mark.parametrize("altitude_msl", [True, False])
+def test_paper_gps_noise_stays_within_its_bounds(make_scenario, altitude_msl):
+    frame = FleetFrame(47.4, 8.5, 480.0, altitude_msl, 47.5)
+    simulation = Simulation(make_scenario(*THREE, frame=frame, gps_speed="norm"), 0.0)
+    position_errors, speed_errors = [], []
+    for world in each_step(simulation, 20.0):
+        for slot, fix in simulation.sensors.fixes():
+            assert fix.time_s == world.time_s
+            position_errors.append(ned_of(frame, fix) - world.position_m[slot])
+            speed_errors.append(fix.speed_mps - np.linalg.norm(world.velocity_mps[slot]))
+    assert len(position_errors) == 3 * 200
+    assert np.abs(position_errors).max() <= 0.15 + 1e-6
+    assert np.std(position_errors) == pytest.approx(0.15 / math.sqrt(3.0), rel=0.05)
+    assert np.abs(speed_errors).max() <= 0.08 + 1e-9
+
+
+def test_ground_speed_and_course_are_those_of_the_horizontal_velocity(make_scenario):
+    vehicle = Vehicle(1, start_m=(0.0, 0.0, 0.0), start_velocity_mps=(-3.0, -4.0, 1.5))
+    simulation = Simulation(make_scenario(vehicle, max_accel_mps2=1e-6), 0.0)
+    for _ in each_step(simulation, 0.1):
+        fixes = simulation.sensors.fixes()
+    fix = fixes[0][1]
+    assert fix.speed_mps == pytest.approx(5.0, abs=0.081)
+    assert fix.course_rad == pytest.approx(math.pi + math.atan2(4.0, 3.0), abs=1e-3)
+
+
+def test_both_heights_are_sent_and_differ_by_the_geoid(make_scenario):
+    frame = FleetFrame(47.4, 8.5, 480.0, False, 47.5)
+    simulation = Simulation(make_scenario(frame=frame), 0.0)
+    for _ in each_step(simulation, 0.1):
+        fixes = simulation.sensors.fixes()
+    fix = fixes[0][1]
+    assert fix.alt_ellipsoid_m - fix.alt_msl_m == pytest.approx(47.5)
+    assert fix.alt_ellipsoid_m == pytest.approx(475.0, abs=0.16)
+
+
+def test_outages_and_jumps_hit_one_agent_only(make_scenario):
+    scenario = make_scenario(
+        *THREE, gps_outages=(Interval(2, 1.0, 2.0),), gps_jumps=(GpsJump(3, 3.0, (8.0, 0.0, 0.0)),)
+    )
+    simulation = Simulation(scenario, 0.0)
+    invalid, jumped = [], []
+    for world in each_step(simulation, 4.0):
+        for slot, fix in simulation.sensors.fixes():
+            if not fix.valid:
+                invalid.append((slot, fix.time_s))
+            elif abs(ned_of(scenario.frame, fix)[0] - world.position_m[slot, 0]) > 4.0:
+                jumped.append((slot, fix.time_s))
+    assert {slot for slot, _ in invalid} == {1}
+    assert [time for _, time in invalid] == pytest.approx([1.0 + 0.1 * k for k in range(10)])
+    assert {slot for slot, _ in jumped} == {2}
+    assert min(time for _, time in jumped) == pytest.approx(3.0)
+
+
+def test_realistic_fixes_are_late_and_older_than_their_stamp(make_scenario):
+    vehicle = Vehicle(1, start_m=(0.0, 0.0, 0.0), start_velocity_mps=(6.0, 0.0, 0.0))
+    offsets = []
+    for seed in range(30):
+        simulation = Simulation(make_scenario(vehicle, seed=seed, profile="realistic", max_accel_mps2=1e-6), 0.0)
+        for world in each_step(simulation, 1.0):
+            for _, fix in simulation.sensors.fixes():
+                assert world.time_s - fix.time_s == pytest.approx(REALISTIC.gps.delivery_s, abs=0.0051)
+                offsets.append(ned_of(simulation.scenario.frame, fix)[0] - 6.0 * fix.time_s)
+    # the mean error along the track is the distance flown within the hidden lag; wander averages out over seeds
+    assert np.mean(offsets) == pytest.approx(-6.0 * REALISTIC.gps.stamp_lag_s, abs=0.3)
+    assert np.std(offsets) == pytest.approx(
+        math.hypot(REALISTIC.gps.horizontal_sigma_m, REALISTIC.gps.horizontal_wander_m), rel=0.35
+    )
+
+
+def test_paper_ranges_are_taken_along_the_edges_within_their_bound(make_scenario):
+    # GIVEN a line of three
+    scenario = make_scenario(*THREE, edges=((1, 2), (3, 2)), uwb_hz=20.0)
+    simulation = Simulation(scenario, 0.0)
+    errors, pairs = [], set()
+    for world in each_step(simulation, 10.0):
+        for ranges in simulation.sensors.ranges():
+            for measured in ranges.ranges:
+                slots = scenario.slot(ranges.observer), scenario.slot(measured.target)
+                distance = np.linalg.norm(world.position_m[slots[0]] - world.position_m[slots[1]])
+                errors.append(measured.range_m - distance)
+                pairs.add((ranges.observer, measured.target))
+    # THEN both ends of each edge measure, at the rate, with their own noise
+    assert pairs == {(1, 2), (2, 1), (2, 3), (3, 2)}
+    assert len(errors) == 4 * 200
+    assert np.abs(errors).max() <= 0.1
+    assert np.std(errors) == pytest.approx(0.1 / math.sqrt(3.0), rel=0.08)
+    assert len(set(errors)) == len(errors)
+
+
+def test_realistic_ranges_have_a_bias_per_pair_and_a_long_tail(make_scenario):
+    simulation = Simulation(make_scenario(*THREE, profile="realistic", uwb_hz=50.0), 0.0)
+    errors: dict[frozenset[int], list[float]] = {}
+    weak: list[float] = []
+    for world in each_step(simulation, 40.0):
+        for ranges in simulation.sensors.ranges():
+            for measured in ranges.ranges:
+                distance = np.linalg.norm(
+                    world.position_m[ranges.observer - 1] - world.position_m[measured.target - 1]
+                )
+                error = measured.range_m - distance
+                errors.setdefault(frozenset((ranges.observer, measured.target)), []).append(error)
+                if measured.rx_dbm - measured.first_path_dbm > 6.0:
+                    weak.append(error - simulation.sensors.pair_bias_m[frozenset((ranges.observer, measured.target))])
+    everything = np.concatenate(list(errors.values()))
+    for pair, pair_errors in errors.items():
+        # the lobes of the two antennas stay in the median, up to their amplitude
+        assert np.median(pair_errors) == pytest.approx(simulation.sensors.pair_bias_m[pair], abs=0.17)
+    assert len(weak) / everything.size == pytest.approx(PAPER.uwb.nlos_probability + 0.03, abs=0.012)
+    assert np.mean(weak) == pytest.approx(1.0, abs=0.25)
+    assert everything.max() < 21.0
+
+
+def test_observers_out_of_reach_measure_nothing(make_scenario):
+    far = (
+        Vehicle(1, path=Waypoints(((0.0, 0.0, 0.0),)), start_m=(0.0, 0.0, 0.0)),
+        Vehicle(2, system_id=2, path=Waypoints(((50.0, 0.0, 0.0),)), start_m=(50.0, 0.0, 0.0)),
+    )
+    simulation = Simulation(make_scenario(*far, uwb_reach_m=30.0), 0.0)
+    for _ in each_step(simulation, 0.5):
+        assert simulation.sensors.ranges() == []
+
+
+def test_staggered_observers_take_turns(make_scenario):
+    simulation = Simulation(make_scenario(*THREE, uwb_staggered=True), 0.0)
+    turns = []
+    for world in each_step(simulation, 1.0):
+        turns += [(ranges.observer, world.time_s) for ranges in simulation.sensors.ranges()]
+    assert len({time for _, time in turns}) == len(turns) == 30
+
+
+def test_realistic_attitude_error_has_its_size_and_keeps_the_quaternion_unit(make_scenario):
+    many = tuple(Vehicle(agent, "ardupilot", agent) for agent in range(1, 101))
+    simulation = Simulation(make_scenario(*many, profile="realistic", edges=()), 0.0)
+    simulation.world.step()
+    samples = np.array([simulation.sensors.attitude(slot).quaternion for slot in range(100)])
+    error = quaternions.to_rotation_vector(
+        quaternions.multiply(quaternions.conjugate(simulation.world.attitude()), samples)
+    )
+    np.testing.assert_allclose(np.linalg.norm(samples, axis=1), 1.0, atol=1e-12)
+    assert error[:, :2].std() == pytest.approx(math.radians(0.4), rel=0.2)
+    assert error[:, 2].std() == pytest.approx(math.radians(2.0), rel=0.25)
+
+
+def test_gauss_markov_is_stationary_and_forgets_at_its_correlation_time():
+    rng = np.random.default_rng(2)
+    process = GaussMarkov(np.full(4000, 2.0), 10.0, rng)
+    first = process.at(0.0).copy()
+    later = process.at(10.0)
+    assert later.std() == pytest.approx(2.0, rel=0.05)
+    assert np.corrcoef(first, later)[0, 1] == pytest.approx(math.exp(-1.0), abs=0.05)
+    assert process.at(10.0) is later
+
+
+def test_pairs_are_biased_within_what_calibration_leaves_or_as_delivered(make_scenario):
+    many = tuple(Vehicle(agent, system_id=agent) for agent in range(1, 31))
+    for calibrated, mean, sigma in ((True, 0.0, 0.1 / math.sqrt(3.0)), (False, 0.3, 0.15)):
+        scenario = make_scenario(*many, profile="realistic", uwb_calibrated=calibrated)
+        bias = np.array(list(Simulation(scenario).sensors.pair_bias_m.values()))
+        assert bias.size == 30 * 29 // 2
+        assert bias.mean() == pytest.approx(mean, abs=0.03)
+        assert bias.std() == pytest.approx(sigma, rel=0.15)

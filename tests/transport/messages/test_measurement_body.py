@@ -1,0 +1,229 @@
+"""Measurement records: round trips, honesty of the rounding, the cut at the size limit, refusals."""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import fields, replace
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from transport.errors import EncodeError, Reason, Rejected
+from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
+from transport.messages.measurement_body import (
+    RECORD_BYTES,
+    AccelerationRecord,
+    AnchorRangeRecord,
+    Measurements,
+    PositionRecord,
+    RangeRecord,
+    Record,
+    RecordKind,
+    SpeedRecord,
+    VelocityRecord,
+    as_sent,
+    decode_measurements,
+    encode_measurements,
+    identity,
+)
+
+ROSTER = frozenset(range(1, 1000))
+TICK = 5000
+
+ids = st.integers(1, 999)
+ticks = st.integers(TICK - 255, TICK)
+
+
+def numbers(limit: float) -> st.SearchStrategy[float]:
+    return st.floats(-limit, limit)
+
+
+def triples(of: st.SearchStrategy[float]) -> st.SearchStrategy[tuple[float, float, float]]:
+    return st.tuples(of, of, of)
+
+
+variances = st.floats(1e-12, 1e8)
+widths = st.one_of(st.just(math.inf), st.floats(1e-6, 1e6))
+offsets = st.floats(-10, 10)
+
+positions = st.builds(
+    PositionRecord, ids, ticks, triples(numbers(1e6)), triples(variances), triples(widths), offsets
+)
+velocities = st.builds(
+    VelocityRecord, ids, ticks, triples(numbers(1e4)), triples(variances), triples(widths), offsets
+)
+speeds = st.builds(SpeedRecord, ids, ticks, numbers(1e4), variances, widths, offsets)
+ranges = st.builds(RangeRecord, ids, ticks, ids, numbers(1e5), variances, widths, offsets).filter(
+    lambda record: record.observer != record.other
+)
+anchors = st.builds(
+    AnchorRangeRecord, ids, ticks, triples(numbers(1e6)), numbers(1e5), variances, widths, offsets
+)
+accelerations = st.builds(AccelerationRecord, ids, ticks, triples(numbers(1e4)), triples(variances))
+records = st.one_of(positions, velocities, speeds, ranges, anchors, accelerations)
+
+RANGE = RangeRecord(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
+SPEED = SpeedRecord(1, TICK, 1.5, 0.04)
+
+
+def flat(value: object) -> list[float]:
+    return list(value) if isinstance(value, tuple) else [value]  # type: ignore[list-item]
+
+
+def round_trip(*given_records: Record) -> tuple[Record, ...]:
+    encoded = encode_measurements(Measurements(TICK, given_records), limit_bytes=100_000)
+    assert encoded.left_out == 0
+    return decode_measurements(encoded.body, tick=TICK, count=encoded.count, roster=ROSTER).records
+
+
+@settings(max_examples=400)
+@given(records)
+def test_a_record_comes_back_close_and_never_more_trusted(record: Record) -> None:
+    # WHEN a record crosses the wire
+    (received,) = round_trip(record)
+    # THEN ids and ticks are exact, values float32-close, and noise and bounds not smaller than they were
+    assert type(received) is type(record)
+    for field in fields(record):
+        sent, came = getattr(record, field.name), getattr(received, field.name)
+        if field.name in ("observer", "other", "tick"):
+            assert sent == came
+        elif field.name.startswith("variance"):
+            for a, b in zip(flat(sent), flat(came), strict=True):
+                assert a * (1 - 1e-12) <= b <= max(a * 1.0025, (math.sqrt(a) + 6e-8) ** 2)
+        elif field.name.startswith("half_width"):
+            for a, b in zip(flat(sent), flat(came), strict=True):
+                assert b >= a
+                assert b <= a * 1.001 + 6e-8 or a > 65504
+        else:
+            for a, b in zip(flat(sent), flat(came), strict=True):
+                assert b == pytest.approx(a, rel=1e-7, abs=1e-37)
+
+
+@settings(max_examples=200)
+@given(records)
+def test_rounding_happens_once(record: Record) -> None:
+    # GIVEN a record as its receivers see it
+    rounded = as_sent(record)
+    # THEN relaying it changes nothing any more, and it is still the same measurement
+    assert round_trip(rounded) == (rounded,)
+    assert identity(rounded) == identity(record)
+
+
+@settings(max_examples=100)
+@given(st.lists(records, max_size=60))
+def test_the_newest_records_that_fit_are_sent(given_records: list[Record]) -> None:
+    encoded = encode_measurements(Measurements(TICK, tuple(given_records)))
+    received = decode_measurements(encoded.body, tick=TICK, count=encoded.count, roster=ROSTER).records
+    # THEN the body keeps its limit, what came is a newest-first prefix, and nothing vanished uncounted
+    assert len(encoded.body) <= MAX_DATAGRAM_BODY_BYTES
+    assert encoded.count + encoded.left_out == len(given_records)
+    by_age = sorted(given_records, key=lambda record: -record.tick)
+    assert [identity(record) for record in received] == [identity(r) for r in by_age[: encoded.count]]
+    if encoded.left_out:
+        left_out = by_age[encoded.count]
+        kind = identity(left_out)[0]
+        assert len(encoded.body) + RECORD_BYTES[kind] > MAX_DATAGRAM_BODY_BYTES
+
+
+def test_one_packet_holds_several_ticks_of_a_mesh_of_five() -> None:
+    # GIVEN an agent that measures position, speed, four ranges and its acceleration every tick
+    ticks_of_records: list[Record] = []
+    for tick in range(TICK - 9, TICK + 1):
+        ticks_of_records += [
+            PositionRecord(1, tick, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)),
+            SpeedRecord(1, tick, 1.0, 0.01),
+            *(RangeRecord(1, tick, other, 7.0, 0.01) for other in (2, 3, 4, 5)),
+            AccelerationRecord(1, tick, (0.1, 0.2, 0.3), (0.01, 0.01, 0.01)),
+        ]
+    # THEN one datagram repairs the loss of six others
+    encoded = encode_measurements(Measurements(TICK, tuple(ticks_of_records)))
+    assert encoded.count >= 7 * 7
+
+
+def test_no_older_record_slips_in_where_a_newer_one_did_not_fit() -> None:
+    # GIVEN room for a speed and a bit more, then a position, then another speed, each a tick older
+    older = replace(SPEED, tick=TICK - 2)
+    position = PositionRecord(1, TICK - 1, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0))
+    limit = 2 * RECORD_BYTES[RecordKind.SPEED]
+    encoded = encode_measurements(Measurements(TICK, (older, position, SPEED)), limit_bytes=limit)
+    assert (encoded.count, encoded.left_out) == (1, 2)
+
+
+def test_what_says_nothing_or_is_too_old_is_left_out_and_counted() -> None:
+    hopeless = replace(SPEED, variance_m2ps2=1e12)
+    old = replace(SPEED, tick=TICK - 256)
+    encoded = encode_measurements(Measurements(TICK, (SPEED, hopeless, old)))
+    assert (encoded.count, encoded.left_out) == (1, 2)
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        replace(SPEED, speed_mps=math.nan),
+        replace(SPEED, speed_mps=math.inf),
+        replace(SPEED, variance_m2ps2=math.nan),
+        replace(SPEED, variance_m2ps2=0.0),
+        replace(SPEED, variance_m2ps2=math.inf),
+        replace(SPEED, half_width_mps=math.nan),
+        replace(SPEED, half_width_mps=-1.0),
+        replace(SPEED, offset_s=math.nan),
+        replace(SPEED, offset_s=11.0),
+        replace(SPEED, tick=TICK + 1),
+        replace(SPEED, tick=-1),
+        replace(SPEED, observer=0),
+        replace(SPEED, observer=1000),
+        replace(RANGE, other=1),
+        replace(RANGE, other=1000),
+        AnchorRangeRecord(1, TICK, (math.nan, 0.0, 0.0), 1.0, 1.0),
+        PositionRecord(1, TICK, (0.0, 0.0, 2e6), (1.0, 1.0, 1.0)),
+    ],
+)
+def test_no_bad_record_is_sent(bad: Record) -> None:
+    with pytest.raises(EncodeError, match="Record"):
+        encode_measurements(Measurements(TICK, (bad,)))
+
+
+SPEED_WIRE = "<BHBffee"
+RANGE_WIRE = "<BHBfHfee"
+
+
+@pytest.mark.parametrize(
+    ("body", "count", "reason"),
+    [
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, math.nan, 1, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, math.inf, 1, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, math.nan, 1, 1, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, math.nan, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, math.inf, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, math.nan), 1, Reason.NOT_FINITE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 0, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, -1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1e5, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 99, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 3, 4, 0, 0, 1, 1, 1), 1, Reason.UNKNOWN_AGENT),
+        (struct.pack(RANGE_WIRE, 4, 1, 0, 0, 4, 1, 1, 1), 1, Reason.UNKNOWN_AGENT),
+        (struct.pack(RANGE_WIRE, 4, 1, 0, 0, 1, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 3, 1, 200, 0, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SPEED_WIRE, 7, 1, 0, 0, 1, 1, 1), 1, Reason.MALFORMED),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1)[:-1], 1, Reason.MALFORMED),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1), 2, Reason.MALFORMED),
+        (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1), 0, Reason.MALFORMED),
+        (b"", 1, Reason.MALFORMED),
+    ],
+)
+def test_bad_bodies_are_refused_with_their_reason(body: bytes, count: int, reason: Reason) -> None:
+    with pytest.raises(Rejected) as refused:
+        decode_measurements(body, tick=100, count=count, roster={1, 2, 3})
+    assert refused.value.reason is reason
+
+
+def test_an_empty_packet_is_a_sign_of_life() -> None:
+    assert decode_measurements(b"", tick=3, count=0, roster={1}) == Measurements(3, ())
+
+
+def test_the_wire_form_is_frozen() -> None:
+    # GIVEN a record whose numbers are exact in the wire form; THEN its bytes are those of version 1
+    encoded = encode_measurements(Measurements(TICK, (replace(RANGE, variance_m2=0.25, half_width_m=0.5),)))
+    assert encoded.body == struct.pack("<BHBfHfee", RecordKind.RANGE, 1, 0, 0.02, 2, 10.0, 0.5, 0.5)

@@ -1,0 +1,1 @@
+"""How it gets there: the Zenoh session, its streams, neighbours' links, consensus rounds, injected faults."""

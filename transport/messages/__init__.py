@@ -1,0 +1,1 @@
+"""What packets say: header and bodies, encoded and decoded."""

@@ -1,0 +1,147 @@
+"""The fixed 40-byte header in front of every packet.
+
+Little endian ``<2sBBHHIIIHHqII``: magic ``CL``, version, kind, sender, flags, boot, sequence number (per
+sender and kind), tick, round, n, time, body length, fleet. ``n`` counts what the body holds: records of a
+measurement body, agents of an information or estimate body, 0 otherwise.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import struct
+from dataclasses import dataclass
+from enum import IntEnum
+
+from transport.errors import EncodeError, Reason, Rejected
+from transport.link.streams import MAX_AGENT_ID, MIN_AGENT_ID, Stream
+
+HEADER = struct.Struct("<2sBBHHIIIHHqII")
+HEADER_BYTES = HEADER.size
+SIGNATURE_BYTES = 64
+MAX_DATAGRAM_BYTES = 1200
+"""Header, body and signature of a packet that crosses a radio unfragmented."""
+MAX_DATAGRAM_BODY_BYTES = MAX_DATAGRAM_BYTES - HEADER_BYTES - SIGNATURE_BYTES
+
+MAGIC = b"CL"
+VERSION = 1
+MAX_TICK = 2**32 - 1
+FLAG_FLOAT64 = 0b1
+"""The body's numbers are float64 instead of float32."""
+KNOWN_FLAGS = FLAG_FLOAT64
+
+
+class Kind(IntEnum):
+    """What the body is; one kind for each stream that carries packets. 4 is not used."""
+
+    MEAS = 1
+    INFO = 2
+    EST = 3
+    CLOCK = 5
+    DIAG = 6
+
+
+STREAM_OF_KIND = {kind: Stream[kind.name] for kind in Kind}
+
+MAX_BODY_BYTES = {
+    Kind.MEAS: MAX_DATAGRAM_BODY_BYTES,
+    Kind.INFO: MAX_DATAGRAM_BODY_BYTES,
+    Kind.EST: 64 * 1024,
+    Kind.CLOCK: 64,
+    Kind.DIAG: 16 * 1024,
+}
+MAX_PACKET_BYTES = HEADER_BYTES + max(MAX_BODY_BYTES.values()) + SIGNATURE_BYTES
+
+
+@dataclass(frozen=True, slots=True)
+class Header:
+    """Who sent what, when and in which order.
+
+    Attributes
+    ----------
+    kind : Kind
+    sender : int
+        Agent id.
+    boot : int
+        Rises with every start of the sender (u32).
+    seq : int
+        Rises with every packet of this kind since the start (u32).
+    tick : int
+        Fleet tick the packet belongs to (u32).
+    round : int
+        Consensus round, 0 where there is none (u16).
+    n : int
+        What the body holds (u16), see the module.
+    t_ns : int
+        Sender's UTC clock when it sent, ns since 1970 (i64).
+    body_bytes : int
+        Length of the body.
+    fleet : int
+        `fleet_hash` of the fleet's name.
+    flags : int
+        `FLAG_FLOAT64` or 0.
+    """
+
+    kind: Kind
+    sender: int
+    boot: int
+    seq: int
+    tick: int
+    round: int
+    n: int
+    t_ns: int
+    body_bytes: int
+    fleet: int
+    flags: int = 0
+
+
+def fleet_hash(fleet: str) -> int:
+    """The first four bytes of BLAKE2b of the fleet's name, as in the header."""
+    return int.from_bytes(hashlib.blake2b(fleet.encode(), digest_size=4).digest(), "little")
+
+
+def pack_header(header: Header) -> bytes:
+    """The 40 bytes; raises `EncodeError` if a field does not fit."""
+    h = header
+    try:
+        return HEADER.pack(
+            MAGIC, VERSION, h.kind, h.sender, h.flags, h.boot, h.seq, h.tick, h.round, h.n, h.t_ns,
+            h.body_bytes, h.fleet,
+        )  # fmt: skip
+    except struct.error as error:
+        raise EncodeError(f"packet header {h}: {error}") from None
+
+
+def unpack_header(packet: bytes, *, fleet: int, signed: bool) -> Header:
+    """The header of a packet whose size, version, kind, flags, fleet and length are as they must be.
+
+    Nothing of the body is looked at. Raises `Rejected`.
+    """
+    if len(packet) < HEADER_BYTES:
+        raise Rejected(Reason.TOO_SHORT, f"{len(packet)} bytes, header alone has {HEADER_BYTES}")
+    if len(packet) > MAX_PACKET_BYTES:
+        raise Rejected(Reason.TOO_LONG, f"{len(packet)} bytes, at most {MAX_PACKET_BYTES}")
+    magic, version, kind_code, sender, flags, boot, seq, tick, round_, n, t_ns, body_bytes, fleet_found = (
+        HEADER.unpack_from(packet)
+    )
+    if magic != MAGIC:
+        raise Rejected(Reason.BAD_MAGIC)
+    if version != VERSION:
+        raise Rejected(Reason.BAD_VERSION, f"version {version}, expected {VERSION}")
+    try:
+        kind = Kind(kind_code)
+    except ValueError:
+        raise Rejected(Reason.UNKNOWN_KIND, f"kind {kind_code}") from None
+    if fleet_found != fleet:
+        raise Rejected(Reason.WRONG_FLEET, f"fleet hash {fleet_found:08x}, expected {fleet:08x}")
+    if flags & ~KNOWN_FLAGS:
+        raise Rejected(Reason.BAD_FLAGS, f"flags {flags:#06x}")
+    if body_bytes > MAX_BODY_BYTES[kind]:
+        raise Rejected(Reason.TOO_LONG, f"{kind.name} body of {body_bytes}, at most {MAX_BODY_BYTES[kind]}")
+    expected = HEADER_BYTES + body_bytes + (SIGNATURE_BYTES if signed else 0)
+    if signed and len(packet) == HEADER_BYTES + body_bytes:
+        raise Rejected(Reason.UNSIGNED, f"from sender {sender}")
+    if len(packet) != expected:
+        raise Rejected(Reason.BAD_LENGTH, f"{len(packet)} bytes, expected {expected}")
+    if not MIN_AGENT_ID <= sender <= MAX_AGENT_ID:
+        raise Rejected(Reason.UNKNOWN_SENDER, f"id {sender}")
+    return Header(kind, sender, boot, seq, tick, round_, n, t_ns, body_bytes, fleet_found, flags)

@@ -1,0 +1,1 @@
+"""Who may say it: keys, signatures, envelopes, replay protection, sealing and opening."""

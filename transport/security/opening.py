@@ -1,0 +1,155 @@
+"""Turns received packets into messages, or refuses them: cheap checks first, numbers last."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from transport.errors import Reason, Rejected, SettingsError
+from transport.link.peers import PeerTable
+from transport.link.streams import check_agent_id, check_fleet_name, parse_key
+from transport.messages.clock_body import decode_clock_answer
+from transport.messages.estimate_body import decode_estimate
+from transport.messages.header import (
+    FLAG_FLOAT64,
+    HEADER_BYTES,
+    STREAM_OF_KIND,
+    Header,
+    Kind,
+    fleet_hash,
+    unpack_header,
+)
+from transport.messages.information_body import decode_part
+from transport.messages.measurement_body import decode_measurements
+from transport.messages.reassembly import Reassembler
+from transport.messages.report_body import decode_diagnostics
+from transport.security.auth import Trust, Unsigned, verify
+from transport.security.replay_guard import ReplayGuard
+from transport.security.sealing import Message
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Received:
+    """A message whose sender is who it says, and whose numbers are sound.
+
+    ``sent_ns`` is the sender's UTC clock, ``received_s`` the ``now`` it was opened at.
+    """
+
+    sender: int
+    kind: Kind
+    seq: int
+    sent_ns: int
+    received_s: float
+    message: Message
+
+
+class Opener:
+    """Opens the packets of one fleet; sans-I/O.
+
+    Parameters
+    ----------
+    fleet : str
+    roster : iterable of int
+        Ids of the whole fleet: who may send, and whom bodies may speak of.
+    trust
+        Public keys of everyone in the roster, or `transport.security.auth.UNSIGNED`.
+    own_id : int, optional
+        Packets that claim to be ours are refused.
+    freshness_s : float, optional
+        Largest difference between the sender's clock and ours; for fleets whose clocks are disciplined. It
+        also stops replays to a receiver that has just started and remembers nothing.
+    replay : ReplayGuard, optional
+        With what was seen before a restart.
+    on_rejected : callable, optional
+        Called with the key and the `Rejected` of every packet that is refused, for the log.
+    """
+
+    def __init__(
+        self,
+        fleet: str,
+        roster: Iterable[int],
+        trust: Trust,
+        *,
+        own_id: int | None = None,
+        freshness_s: float | None = None,
+        replay: ReplayGuard | None = None,
+        on_rejected: Callable[[str, Rejected], None] | None = None,
+    ) -> None:
+        self._fleet_name = check_fleet_name(fleet)
+        self._fleet = fleet_hash(fleet)
+        self._roster = frozenset(check_agent_id(agent_id) for agent_id in roster)
+        self._trust = trust
+        self._own_id = own_id
+        self._freshness_ns = None if freshness_s is None else round(freshness_s * 1e9)
+        self.replay = replay or ReplayGuard()
+        self._on_rejected = on_rejected
+        self.peers = PeerTable(self._roster - {own_id})
+        self._reassembler = Reassembler(self._roster, self._count_expired)
+        if not isinstance(trust, Unsigned):
+            missing = sorted(self._roster - {own_id} - trust.keys())
+            if missing:
+                raise SettingsError(f"no public key for agents {missing}")
+
+    def open(self, key: str, packet: bytes, *, now: float, unix_ns: int) -> Received | None:
+        """The message in a packet that came under a key expression.
+
+        ``None`` for a packet that is refused (then counted, by reason and by the agent its key names) and
+        for a part of a message of which more is to come. Never raises for anything in ``packet``.
+        """
+        try:
+            return self._open(key, packet, now, unix_ns)
+        except Rejected as rejected:
+            parsed = parse_key(key)
+            self.peers.rejected(parsed[1] if parsed else None, rejected.reason)
+            if self._on_rejected is not None:
+                self._on_rejected(key, rejected)
+            return None
+
+    def expire(self, now: float) -> None:
+        """Give up messages whose missing parts have not come in time; call it once in a while."""
+        self._reassembler.expire(now)
+
+    def _open(self, key: str, packet: bytes, now: float, unix_ns: int) -> Received | None:
+        header = unpack_header(packet, fleet=self._fleet, signed=not isinstance(self._trust, Unsigned))
+        self._check_sender(key, header)
+        if self._freshness_ns is not None and abs(unix_ns - header.t_ns) > self._freshness_ns:
+            raise Rejected(Reason.STALE, f"clock {(unix_ns - header.t_ns) * 1e-9:.3f} s behind ours")
+        self.replay.check(header)
+        body = packet[HEADER_BYTES : HEADER_BYTES + header.body_bytes]
+        if not isinstance(self._trust, Unsigned):
+            verify(self._trust[header.sender], key, packet)
+        self.replay.commit(header)
+        message = self._decode(header, body, now)
+        self.peers.accepted(header, now)
+        if message is None:
+            return None
+        return Received(header.sender, header.kind, header.seq, header.t_ns, now, message)
+
+    def _check_sender(self, key: str, header: Header) -> None:
+        if parse_key(key) != (self._fleet_name, header.sender, STREAM_OF_KIND[header.kind]):
+            raise Rejected(Reason.WRONG_KEY, f"{header.kind.name} of agent {header.sender} under {key!r}")
+        if header.sender == self._own_id:
+            raise Rejected(Reason.OWN_ID, f"id {header.sender} is ours")
+        if header.sender not in self._roster:
+            raise Rejected(Reason.UNKNOWN_SENDER, f"id {header.sender}")
+
+    def _decode(self, header: Header, body: bytes, now: float) -> Message | None:
+        h, double = header, bool(header.flags & FLAG_FLOAT64)
+        match header.kind:
+            case Kind.MEAS:
+                return decode_measurements(body, tick=h.tick, count=h.n, roster=self._roster)
+            case Kind.INFO:
+                part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
+                return self._reassembler.add(h.sender, h.tick, h.round, part, now)
+            case Kind.EST:
+                return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
+            case Kind.CLOCK:
+                return decode_clock_answer(body)
+            case Kind.DIAG:
+                report = decode_diagnostics(body)
+                if report.agent_id != h.sender:
+                    raise Rejected(Reason.OUT_OF_RANGE, f"{h.kind.name} of agent {report.agent_id}")
+                return report
+
+    def _count_expired(self, sender: int, parts: int) -> None:
+        self.peers.rejected(sender, Reason.PART_EXPIRED, parts)

@@ -1,4 +1,4 @@
-"""The rooms stay apart, modules stay small, and nothing of a developer's machine gets into the sources.
+"""The rooms stay apart, their floors stay small, and nothing of a developer's machine gets into the sources.
 
 Each check is a function that lists faults, and is itself tested on made-up faults.
 """
@@ -9,6 +9,7 @@ import ast
 import re
 import subprocess
 import tomllib
+from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -25,7 +26,8 @@ MAY_IMPORT: dict[str, set[str]] = {
 }
 """Room -> rooms it may import besides itself; the table of docs/architecture.md."""
 
-MOST_LINES = 400
+MOST_FILES = 16
+"""Modules in one folder; one idea a file decides how long a file is."""
 
 MACHINE_PATH = re.compile(r"""(?<![\w.$}~-])/(?:home|root|Users|work|workspace|mnt)/[\w.-]+""")
 ALLOWED_PATH = {"/home/pilot"}
@@ -144,9 +146,29 @@ def test_import_check_allows_the_table(name: str, source: str) -> None:
     assert list(import_faults(name, source)) == []
 
 
-def test_modules_are_small() -> None:
-    long = {dotted(path): len(path.read_text().splitlines()) for path in modules()}
-    assert {name: lines for name, lines in long.items() if lines > MOST_LINES} == {}
+def crowded_folders(paths: list[Path]) -> dict[str, int]:
+    """Folders with more modules than a reader can survey."""
+    count = Counter(str(path.parent.relative_to(ROOT)) for path in paths if path.name != "__init__.py")
+    return {folder: files for folder, files in count.items() if files > MOST_FILES}
+
+
+def test_floors_can_be_surveyed() -> None:
+    assert crowded_folders(modules()) == {}
+
+
+def test_floor_check_finds_faults() -> None:
+    paths = [ROOT / "agent" / "hall" / f"module_{i}.py" for i in range(MOST_FILES + 1)]
+    assert crowded_folders(paths) == {"agent/hall": MOST_FILES + 1}
+
+
+def test_floors_say_what_lives_there() -> None:
+    folders = {path.parent for path in modules()}
+    silent = [str(folder.relative_to(ROOT)) for folder in folders if not _docstring(folder / "__init__.py")]
+    assert silent == []
+
+
+def _docstring(init: Path) -> str | None:
+    return ast.get_docstring(ast.parse(init.read_text())) if init.is_file() else None
 
 
 def test_sources_know_nothing_of_one_machine() -> None:

@@ -255,10 +255,10 @@ def entries() -> tuple[str, ...]:
 
 
 def import_all() -> None:
-    """Import every module of this package, so that every entry is known."""
-    package = __name__.rpartition(".")[0]
-    for module in pkgutil.iter_modules(importlib.import_module(package).__path__):
-        importlib.import_module(f"{package}.{module.name}")
+    """Import every module of the room, on all its floors, so that every entry is known."""
+    room = __name__.partition(".")[0]
+    for module in pkgutil.walk_packages(importlib.import_module(room).__path__, f"{room}."):
+        importlib.import_module(module.name)
 
 
 def is_warm() -> bool:

@@ -30,7 +30,7 @@ SAMPLE = {
     "__init__.py": "",
     "constants.py": "FACTOR = 2.0\n",
     "inner.py": """
-        from estimators.compiled import kernel
+        from estimators.compiled.entries import kernel
         from sample.constants import FACTOR
 
         @kernel
@@ -39,7 +39,7 @@ SAMPLE = {
         """,
     "outer.py": """
         import numpy as np
-        from estimators.compiled import entry, kernel
+        from estimators.compiled.entries import entry, kernel
         from . import inner
 
         ROW = np.dtype([("value", np.float64), ("kind", np.int32)], align=True)
@@ -65,7 +65,7 @@ SAMPLE = {
 CHILD = """
 import dataclasses, json, sys
 import numpy as np
-from estimators import compiled
+from estimators.compiled import entries as compiled
 from sample import outer
 
 def tell(progress):
@@ -425,3 +425,17 @@ def test_cache_folder_follows_the_environment(monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.delenv("XDG_CACHE_HOME")
     monkeypatch.setenv("HOME", "/home/pilot")
     assert kernel_cache.cache_folder() == Path("/home/pilot/.cache/fleetloc")
+
+
+def test_import_all_knows_the_entries_of_every_floor() -> None:
+    # GIVEN the modules whose sources declare an entry
+    floors = ROOT / "estimators"
+    sources = {path.relative_to(ROOT): path.read_text() for path in floors.rglob("*.py")}
+    declaring = {
+        ".".join(path.with_suffix("").parts) for path, text in sources.items() if "\n@entry(" in text
+    }
+    assert len({name.split(".")[1] for name in declaring}) >= 5  # they lie on many floors
+    # WHEN everything is imported
+    compiled.import_all()
+    # THEN something is known of each
+    assert declaring <= {name.rpartition(".")[0] for name in compiled.entries()}

@@ -6,13 +6,14 @@ import math
 from collections import Counter
 from io import BytesIO
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
-from sim_bridge.replay.logs.dataflash.records import RecordReader
+from sim_bridge.replay.logs.dataflash.records import FMT_BYTES, HEAD, LONGEST_RECORD_BYTES, RecordReader
 from sim_bridge.replay.logs.dataflash.source import CONFIRM_RECORDS
 from sim_bridge.replay.logs.events import LogError, TruthSample
 from tests.support.logs import FMT_OF_FMT, check_refusal, entry, fmt, read
@@ -180,17 +181,54 @@ def records(data: bytes) -> tuple[int, Counter[str]]:
     return len(list(reader)), skipped
 
 
-@given(st.integers(len(HEADER), len(FLIGHT)), st.binary(max_size=300))
-def test_garbage_between_records_costs_at_most_those_it_cuts(place: int, garbage: bytes) -> None:
+class Place(NamedTuple):
+    """A record behind the descriptions, as it was written."""
+
+    begin: int
+    end: int
+    kind: int
+
+
+def _places() -> list[Place]:
+    described = [HEADER[at : at + FMT_BYTES] for at in range(0, len(HEADER), FMT_BYTES)]
+    lengths = {description[3]: description[4] for description in described}
+    found, at = [], len(HEADER)
+    while at < len(FLIGHT):
+        found.append(Place(at, at + lengths[FLIGHT[at + 2]], FLIGHT[at + 2]))
+        at = found[-1].end
+    return found
+
+
+PLACES = _places()
+IMU_RECORDS = sum(place.kind == IMU for place in PLACES)
+
+
+@given(st.integers(len(HEADER), len(FLIGHT)), st.binary(min_size=1, max_size=300))
+def test_garbage_costs_the_record_it_cuts_or_hides_the_end_of(place: int, garbage: bytes) -> None:
+    """GIVEN a format without checksums THEN a record is believed if another begins, with two bytes, at its end."""
+    garbage = garbage.translate(None, HEAD) or b"x"
     found, _ = records(FLIGHT[:place] + garbage + FLIGHT[place:])
-    assert 158 <= found <= 162
+    lost = [each for each in PLACES if each.begin < place < each.end + len(HEAD)]
+    assert found == IMU_RECORDS - sum(each.kind == IMU for each in lost)
 
 
-@pytest.mark.parametrize("cut", range(0, 120))
-def test_a_cut_end_loses_only_the_last_record(cut: int) -> None:
-    found, skipped = records(FLIGHT[: len(FLIGHT) - cut])
-    assert found >= 158
-    assert set(skipped) <= {"bytes of a cut last record"}
+@given(st.integers(len(HEADER), len(FLIGHT)), st.binary(max_size=300))
+def test_a_false_head_costs_at_most_the_records_in_its_reach(place: int, garbage: bytes) -> None:
+    found, _ = records(FLIGHT[:place] + garbage + FLIGHT[place:])
+    reach = range(place - len(HEAD) + 1, place + LONGEST_RECORD_BYTES)
+    lost = sum(each.kind == IMU and each.end >= reach.start and each.begin < reach.stop for each in PLACES)
+    assert IMU_RECORDS - lost <= found <= IMU_RECORDS + garbage.count(HEAD)
+
+
+def test_a_cut_end_loses_only_what_is_not_there() -> None:
+    """AND the last one that is, if the head behind it is cut in two."""
+    for cut in range(121):
+        left = len(FLIGHT) - cut
+        found, skipped = records(FLIGHT[:left])
+        believed = [each for each in PLACES if each.end == left or each.end + len(HEAD) <= left]
+        assert found == sum(each.kind == IMU for each in believed)
+        rest = left - believed[-1].end
+        assert skipped == ({"bytes of a cut last record": rest} if rest else {})
 
 
 def test_a_damaged_description_is_counted_and_not_used() -> None:

@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-from tests.fleetloc.report.test_fleet_report import AGENTS, LINE3, TICKS, make_run
 
 from fleetloc import cli
+from tests.fleetloc.report.test_fleet_report import AGENTS, LINE3, TICKS, make_run
 
 
 def test_the_report_of_a_finished_run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -19,6 +19,7 @@ import msgspec
 
 from agent.config.tables import FleetConfig
 from estimators.settings import DEFAULT_KIND, DEFAULTS_OF_KIND, EstimatorSettings
+from fleetloc.whole_config import OTHER_TABLES
 
 HEADER = """# Configuration reference
 
@@ -36,8 +37,10 @@ def reference() -> str:
     """The page, in Markdown."""
     parts = [HEADER]
     for field in msgspec.structs.fields(FleetConfig):
-        struct, is_array = _table_of(field.type)
-        parts.append(_table(field.name, struct, is_array))
+        if field.name != "others":
+            struct, is_array = _table_of(field.type)
+            parts.append(_table(field.name, struct, is_array))
+    parts += [_table(name, struct, False) for name, struct in OTHER_TABLES.items()]
     return "\n".join(parts)
 
 

@@ -14,13 +14,14 @@ import pytest
 import typer
 import yaml
 
-from agent.config.reading import FleetConfig, config_from, merged
-from agent.config.tables import SensorsTable
+from agent.config.reading import config_from, merged
+from agent.config.tables import FleetConfig, SensorsTable
 from agent.exit_codes import ExitCode
 from agent.uwb.adapter import UwbAdapter
 from agent.watch.health import Facts, State, assess
 from estimators.estimator import Status
 from fleetloc.cli import build_app
+from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
 from transport.errors import Reason
 
@@ -35,7 +36,7 @@ SHELL = ("sh", "bash", "console", "")
 ROOMS = "configs|tests|estimators|transport|agent|sim_bridge|fleetloc"
 OURS = re.compile(rf"(?<![\w/.])(?:{ROOMS})/(?:[\w-]+/)*[\w-]+\.(?:py|toml)\b")
 CONTROL = ("|", "&", "&&", "||", ";", ">", "<", "2>", "#", "\\")
-TABLES = {field.name for field in msgspec.structs.fields(FleetConfig)}
+TABLES = {field.name for field in msgspec.structs.fields(FleetConfig)} - {"others"} | OTHER_TABLES.keys()
 
 
 class Block(NamedTuple):
@@ -182,7 +183,7 @@ def test_every_toml_block_is_accepted(block: Block, tmp_path: Path) -> None:
         load_mission(mission, config_from(stub(), "stub"))
         return
     assert document.keys() <= TABLES, f"{block.page}: begin the block with the header of its table"
-    config_from(merged(stub(), document), block.page)
+    whole(config_from(merged(stub(), document), block.page))
 
 
 def test_the_first_configuration_is_whole() -> None:

@@ -76,18 +76,6 @@ def _check_references(config: FleetConfig, where: str) -> None:
         _known(config, where, f"fleet.edges[{index}]", edge)
         if edge[0] == edge[1]:
             raise ConfigError(where, f"fleet.edges[{index}]", "two different agents", f"{list(edge)}")
-    for index, outage in enumerate(config.sim.gps_outages):
-        key = f"sim.gps_outages[{index}]"
-        _known(config, where, f"{key}.agent", (outage.agent,))
-        if outage.to_s <= outage.from_s:
-            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
-    flown: set[int] = set()
-    for index, path in enumerate(config.sim.paths):
-        key = f"sim.paths[{index}].agent"
-        _known(config, where, key, (path.agent,))
-        if path.agent in flown:
-            raise ConfigError(where, key, "one path per agent", f"a second path of agent {path.agent}")
-        flown.add(path.agent)
 
 
 def _check_radio(config: FleetConfig, where: str) -> None:
@@ -123,9 +111,8 @@ def _check_services(config: FleetConfig, where: str) -> None:
     if metrics.base_port is not None and metrics.base_port + len(config.agents) - 1 > MAX_PORT:
         found = f"{metrics.base_port + len(config.agents) - 1} for the last"
         raise ConfigError(where, "metrics.base_port", f"a port for each agent up to {MAX_PORT}", found)
-    for key, host in (("metrics.host", metrics.host), ("monitor.host", config.monitor.host)):
-        if not is_host(host):
-            raise ConfigError(where, key, "an address to listen on", repr(host))
+    if not is_host(metrics.host):
+        raise ConfigError(where, "metrics.host", "an address to listen on", repr(metrics.host))
     if adsb.address is not None:
         try:
             parse_endpoint(adsb.address)

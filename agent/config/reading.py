@@ -11,32 +11,20 @@ import math
 import re
 import tomllib
 import typing
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
+from collections.abc import Set as AbstractSet
 from pathlib import Path as FilePath
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
 from agent.config.checks import check_fleet
-from agent.config.tables import AgentTable as AgentTable
-from agent.config.tables import CirclePath as CirclePath
-from agent.config.tables import FigureEightPath as FigureEightPath
-from agent.config.tables import FleetConfig as FleetConfig
-from agent.config.tables import FleetTable as FleetTable
-from agent.config.tables import GpsOutage as GpsOutage
-from agent.config.tables import InitialTable as InitialTable
-from agent.config.tables import MavlinkTable as MavlinkTable
-from agent.config.tables import OriginTable as OriginTable
-from agent.config.tables import Path as Path
-from agent.config.tables import RecordTable as RecordTable
-from agent.config.tables import SecurityTable as SecurityTable
-from agent.config.tables import SensorsTable as SensorsTable
-from agent.config.tables import SimTable as SimTable
-from agent.config.tables import TransportTable as TransportTable
-from agent.config.tables import WaypointsPath as WaypointsPath
+from agent.config.other_tables import READ_BY_OTHERS, OtherTables
+from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
 from estimators.settings import EstimatorSettings, with_kind_defaults
 
+T = TypeVar("T", bound=msgspec.Struct)
 MAX_FILE_BYTES = 1_000_000
 OVERRIDE = "override"
 PLAIN_NAMES = {
@@ -136,20 +124,54 @@ def config_from(document: dict[str, Any], where: str, overrides: Iterable[str] =
 
 def _decoded(document: dict[str, Any], where: str, overrides: Iterable[str]) -> FleetConfig:
     """Every setting by itself as it may be; what has to hold between them is not looked at."""
-    overridden = {_override(document, override) for override in overrides}
-    _check_finite(document, where, "")
-    if isinstance(document.get("estimator"), dict):
-        document = document | {"estimator": with_kind_defaults(document["estimator"])}
+    overridden = frozenset(_override(document, override) for override in overrides)
+    others = {name: document[name] for name in READ_BY_OTHERS if name in document}
+    own = {name: value for name, value in document.items() if name not in others}
+    if isinstance(own.get("estimator"), dict):
+        own["estimator"] = with_kind_defaults(own["estimator"])
+    if "others" in own:
+        raise ConfigError(where, "others", _one_of(_table_names()), "an unknown key")
+    config = _converted(own, FleetConfig, "", where, overridden)
+    return msgspec.structs.replace(config, others=OtherTables(others, where, overridden))
+
+
+def other_table(config: FleetConfig, name: str, struct: type[T]) -> T:
+    """A table that another room than the agent reads, as strictly as the agent reads its own.
+
+    Raises `ConfigError`. What has to hold between its settings and others is for the caller to check.
+    """
+    others = config.others
+    return _converted(others.tables.get(name, {}), struct, name, others.where, others.overridden)
+
+
+def with_other_table(config: FleetConfig, name: str, table: msgspec.Struct) -> FleetConfig:
+    """A configuration with one of the tables that others read put in or replaced."""
+    others = config.others
+    tables = {**others.tables, name: msgspec.to_builtins(table)}
+    return msgspec.structs.replace(config, others=OtherTables(tables, others.where, others.overridden))
+
+
+def _converted(
+    value: Any, struct: type[T], prefix: str, where: str, overridden: AbstractSet[str]
+) -> T:
+    """A table, or the whole of them; ``prefix`` is its key."""
+    _check_finite(value, where, prefix)
     try:
-        return msgspec.convert(document, FleetConfig)
+        return msgspec.convert(value, struct)
     except msgspec.ValidationError as error:
-        raise _explained(error, document, where, overridden) from error
+        raise _explained(error, value, struct, prefix, where, overridden) from error
+
+
+def effective(config: FleetConfig) -> dict[str, Any]:
+    """All tables as plain values, defaults filled in; those of other rooms as far as they were written."""
+    tables: dict[str, Any] = msgspec.to_builtins(config)
+    return {name: table for name, table in tables.items() if name != "others"} | dict(config.others.tables)
 
 
 def dump(config: FleetConfig) -> str:
-    """The effective configuration as TOML, defaults filled in; `load_config` reads it back unchanged."""
+    """The effective configuration as TOML; `load_config` reads it back unchanged."""
     lines: list[str] = []
-    for name, table in msgspec.to_builtins(config).items():
+    for name, table in effective(config).items():
         for entry in table if isinstance(table, list | tuple) else (table,):
             lines.append(f"[{name}]" if entry is table else f"[[{name}]]")
             lines += [f"{key} = {_toml(value)}" for key, value in entry.items() if value is not None]
@@ -209,7 +231,7 @@ def _index_of(tables: list[Any], name: str, spelled: str, where: str) -> int:
 
 
 def _explained(
-    error: msgspec.ValidationError, document: Mapping[str, Any], where: str, overridden: set[str]
+    error: msgspec.ValidationError, table: Any, struct: Any, prefix: str, where: str, overridden: AbstractSet[str]
 ) -> ConfigError:
     """Turn msgspec's message (what, at which path) into one that also names what was found."""
     message = str(error)
@@ -217,17 +239,20 @@ def _explained(
     what, path = (match.group(1), match.group(2) or "") if match else (message, "")
     unknown = re.search(r"unknown field `([^`]*)`", what)
     missing = re.search(r"missing required field `([^`]*)`", what)
+    inside = f"{prefix}.{path}".strip(".")
     if unknown:
-        key = f"{path}.{unknown.group(1)}" if path else unknown.group(1)
-        expected, found = _one_of(_known_keys(path, document)), "an unknown key"
+        key = f"{inside}.{unknown.group(1)}".strip(".")
+        expected, found = _one_of(_known_keys(path, table, struct)), "an unknown key"
     elif missing:
-        key = f"{path}.{missing.group(1)}" if path else missing.group(1)
+        key = f"{inside}.{missing.group(1)}".strip(".")
         expected, found = "a value (the key is required)", "nothing"
     else:
-        key = path
+        key = inside
         plain = re.sub(r"`(\w+)`", lambda name: PLAIN_NAMES.get(name.group(1), name.group(1)), what)
-        expected = _choices(path) if what.startswith("Invalid") else re.sub(r"^Expected |, got .*$", "", plain)
-        found = _abbreviated(_value_at(document, path))
+        expected = (
+            _choices(path, struct) if what.startswith("Invalid") else re.sub(r"^Expected |, got .*$", "", plain)
+        )
+        found = _abbreviated(_value_at(table, path))
     return ConfigError(OVERRIDE if key in overridden else where, key, expected, found)
 
 
@@ -251,10 +276,17 @@ def _abbreviated(value: Any) -> str:
     return text if len(text) <= 80 else f"{text[:77]}..."
 
 
-def _known_keys(path: str, document: Mapping[str, Any]) -> list[str]:
+def _table_names() -> list[str]:
+    own = [name for name in FleetConfig.__struct_encode_fields__ if name != "others"]
+    return [*own, *READ_BY_OTHERS]
+
+
+def _known_keys(path: str, document: Any, root: Any) -> list[str]:
     """Names of the keys that the table at ``path`` may have; of a union, those of the ``kind`` given."""
+    if root is FleetConfig and not path:
+        return _table_names()
     names: list[str] = []
-    structs = typing.get_args(_type_at(path)) or (_type_at(path),)
+    structs = typing.get_args(_type_at(path, root)) or (_type_at(path, root),)
     tag = _value_at(document, f"{path}.kind")
     for struct in structs:
         tag_field = struct.__struct_config__.tag_field
@@ -263,21 +295,21 @@ def _known_keys(path: str, document: Mapping[str, Any]) -> list[str]:
     return names
 
 
-def _choices(path: str) -> str:
+def _choices(path: str, root: Any) -> str:
     """What may stand at a key whose values are enumerated."""
     table, _, key = path.rpartition(".")
-    if key == "kind" and typing.get_args(_type_at(table)):
-        return _one_of(struct.__struct_config__.tag for struct in typing.get_args(_type_at(table)))
-    return _one_of(typing.get_args(_type_at(path)))
+    if key == "kind" and typing.get_args(_type_at(table, root)):
+        return _one_of(struct.__struct_config__.tag for struct in typing.get_args(_type_at(table, root)))
+    return _one_of(typing.get_args(_type_at(path, root)))
 
 
 def _one_of(values: Iterable[Any]) -> str:
     return f"one of {', '.join(str(value) for value in values)}"
 
 
-def _type_at(path: str) -> Any:
+def _type_at(path: str, root: Any) -> Any:
     """Declared type at a path, annotations and ``None`` stripped."""
-    kind: Any = FleetConfig
+    kind: Any = root
     for step in _steps(path):
         inner = typing.get_args(kind)[0] if isinstance(step, int) else typing.get_type_hints(kind)[step]
         kind = _stripped(inner)

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Literal
 
-import msgspec
+from agent.config.fields import Positive, Table
 
-Positive = Annotated[float, msgspec.Meta(gt=0)]
 Profile = Literal["lab", "field", "lossy_field"]
 
 
-class SecurityTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SecurityTable(Table, frozen=True):
     """``[security]``: how the fleet is protected; docs/security.md says against whom."""
 
     profile: Profile = "lab"

@@ -9,25 +9,13 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable, MonitorTable
-from agent.config.security_table import SecurityTable as SecurityTable
-from agent.config.sitl_table import SitlTable
+from agent.config.fields import AgentId, Fraction, Name, NotNegative, Point, Positive, Seed, Table
+from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable
+from agent.config.other_tables import OtherTables
+from agent.config.security_table import SecurityTable
 from agent.radio.radio_faults import FaultsTable
 from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
 from estimators.settings import EstimatorSettings, default_settings
-
-AgentId = Annotated[int, msgspec.Meta(ge=1, le=999)]
-Positive = Annotated[float, msgspec.Meta(gt=0)]
-NotNegative = Annotated[float, msgspec.Meta(ge=0)]
-Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
-Seed = Annotated[int, msgspec.Meta(ge=0)]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,32}$")]
-Point = tuple[float, float, float]
-"""NED metres in the fleet frame."""
-
-
-class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
-    """A table of the configuration: frozen, unknown keys refused."""
 
 
 class OriginTable(Table, frozen=True):
@@ -214,71 +202,6 @@ class TransportTable(Table, frozen=True):
     """What else is injected after receive."""
 
 
-class GpsOutage(Table, frozen=True):
-    """``[[sim.gps_outages]]``: one agent's receiver sees nothing for a while."""
-
-    agent: AgentId
-    from_s: NotNegative
-    to_s: Positive
-
-
-class WaypointsPath(Table, frozen=True, tag_field="kind", tag="waypoints"):
-    """Fly to the points in turn, each held for a while."""
-
-    agent: AgentId
-    points_m: Annotated[tuple[Point, ...], msgspec.Meta(min_length=1)]
-    hold_s: Positive = 10.0
-    """Time from one point to the next."""
-    repeat: bool = True
-
-
-class CirclePath(Table, frozen=True, tag_field="kind", tag="circle"):
-    """A horizontal circle, right-handed about down (clockwise from above)."""
-
-    agent: AgentId
-    center_m: Point
-    radius_m: Positive = 5.0
-    lap_s: Positive = 20.0
-    phase_rad: float = 0.0
-
-
-class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
-    """A horizontal Lissajous eight: north at the lap's frequency, east at twice that."""
-
-    agent: AgentId
-    center_m: Point
-    length_m: Positive = 10.0
-    """North-south extent."""
-    width_m: Positive = 5.0
-    """East-west extent."""
-    lap_s: Positive = 20.0
-    phase_rad: float = 0.0
-
-
-Path = WaypointsPath | CirclePath | FigureEightPath
-
-
-class SimTable(Table, frozen=True):
-    """``[sim]``: the simulated world; no agent reads it."""
-
-    seed: Seed = 1
-    profile: Literal["paper", "realistic"] = "paper"
-    """Noise: the paper's uniform one, or what real sensors look like."""
-    duration_s: Positive = 60.0
-    imu_hz: Annotated[float, msgspec.Meta(ge=10, le=1000)] = 100.0
-    attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
-    gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
-    uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
-    max_accel_mps2: Positive = 2.0
-    """Commanded acceleration is clipped to this per axis."""
-    start_position_half_width_m: NotNegative = 15.0
-    """Starts are drawn uniformly from a cube about each path's start."""
-    start_speed_half_width_mps: NotNegative = 2.0
-    gps_outages: tuple[GpsOutage, ...] = ()
-    paths: tuple[Path, ...] = ()
-    """One per agent."""
-
-
 class RecordTable(Table, frozen=True):
     """``[record]``: flight records on disk."""
 
@@ -312,14 +235,13 @@ class FleetConfig(Table, frozen=True):
     mavlink: MavlinkTable = msgspec.field(default_factory=MavlinkTable)
     transport: TransportTable = msgspec.field(default_factory=TransportTable)
     security: SecurityTable = msgspec.field(default_factory=SecurityTable)
-    sim: SimTable = msgspec.field(default_factory=SimTable)
     record: RecordTable = msgspec.field(default_factory=RecordTable)
     health: HealthTable = msgspec.field(default_factory=HealthTable)
     metrics: MetricsTable = msgspec.field(default_factory=MetricsTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
     adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)
-    monitor: MonitorTable = msgspec.field(default_factory=MonitorTable)
-    sitl: SitlTable = msgspec.field(default_factory=SitlTable)
+    others: OtherTables = msgspec.field(default_factory=OtherTables)
+    """Tables that other rooms read; no key of the file has this name."""
 
     @property
     def ids(self) -> tuple[int, ...]:

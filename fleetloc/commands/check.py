@@ -32,13 +32,14 @@ def check(
     """
     import time
 
-    from agent.config.reading import dump, load_config
+    from agent.config.reading import dump
     from agent.radio.security import agents_here, expiry_warnings, security_faults, state_warnings
     from agent.sensing.clock import require_epoch
     from fleetloc.errors import InputError
+    from fleetloc.whole_config import load_whole
     from sim_bridge.world.scenario_config import scenario_from_config
 
-    fleet = load_config(config, overrides or (), profiles or ())
+    fleet = load_whole(config, overrides or (), profiles or ())
     scenario_from_config(fleet)
     if show:
         typer.echo(dump(fleet), nl=False)

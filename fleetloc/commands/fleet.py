@@ -76,13 +76,14 @@ def _prepared(
 
     Checks before anything starts: the scenario, and for a live run what the security profile promises.
     """
-    from agent.config.reading import dump, load_config
+    from agent.config.reading import dump
     from agent.radio.security import require
     from agent.sensing.clock import require_epoch
     from fleetloc.run import run_files
+    from fleetloc.whole_config import load_whole
     from sim_bridge.world.scenario_config import scenario_from_config
 
-    fleet = load_config(config, settings, profiles)
+    fleet = load_whole(config, settings, profiles)
     scenario_from_config(fleet)
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     run_files.refuse_inputs(folder, (config, *profiles))

@@ -51,6 +51,8 @@ def sitl(
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files
     from fleetloc.warmup import announce, warm_up_everything
+    from sim_bridge.sitl.sitl_table import sitl_table
+    from sim_bridge.world.sim_table import sim_table
 
     options: dict[str, float | int | None] = {
         "sim.duration_s": duration_s,
@@ -64,7 +66,8 @@ def sitl(
     folder = _write_folder(config, fleet, out)
     announce()
     warm_up_everything()
-    limit_s = duration_s if duration_s is not None or fleet.sitl.mission is not None else fleet.sim.duration_s
+    without_end = duration_s is None and sitl_table(fleet).mission is None
+    limit_s = sim_table(fleet).duration_s if without_end else duration_s
     effective, run = _fly(folder, limit_s)
     if run.outcome.wall_s == 0.0:  # interrupted before anything flew
         raise typer.Exit(INTERRUPTED)
@@ -80,24 +83,29 @@ def _prepared(
     """The effective configuration, checked as far as that is possible before anything is started."""
     import msgspec
 
-    from agent.config.reading import load_config
+    from agent.config.reading import with_other_table
     from fleetloc.run.gps_drops import gps_outage
+    from fleetloc.whole_config import load_whole
     from sim_bridge.sitl.mission import load_mission
     from sim_bridge.sitl.pilot import require_client
     from sim_bridge.sitl.setup import vehicle_links
+    from sim_bridge.sitl.sitl_table import sitl_table
+    from sim_bridge.world.sim_table import sim_table
 
-    fleet = load_config(file, settings)
+    fleet = load_whole(file, settings)
     vehicle_links(fleet)
     replace = msgspec.structs.replace
+    sitl, sim = sitl_table(fleet), sim_table(fleet)
     wanted = None if mission == NO_MISSION else mission
-    if mission is None and fleet.sitl.mission is not None:
-        wanted = str(file.parent / fleet.sitl.mission)
-    fleet = replace(fleet, sitl=replace(fleet.sitl, mission=None if wanted is None else str(Path(wanted).resolve())))
+    if mission is None and sitl.mission is not None:
+        wanted = str(file.parent / sitl.mission)
+    sitl = replace(sitl, mission=None if wanted is None else str(Path(wanted).resolve()))
+    fleet = with_other_table(fleet, "sitl", sitl)
     if wanted is not None:
         load_mission(Path(wanted), fleet)
         require_client()
     outages = tuple(gps_outage(text, fleet.ids, duration_s) for text in drop_gps)
-    return replace(fleet, sim=replace(fleet.sim, gps_outages=fleet.sim.gps_outages + outages))
+    return with_other_table(fleet, "sim", replace(sim, gps_outages=sim.gps_outages + outages))
 
 
 def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
@@ -108,10 +116,12 @@ def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
     from agent.radio.security import key_folder
     from agent.sensing.clock import require_epoch
     from fleetloc.run import run_files
+    from sim_bridge.sitl.sitl_table import sitl_table
     from transport.security.keys import load_secret, load_trust
 
     folder = (out or Path("out") / fleet.fleet.name).resolve()
-    run_files.refuse_inputs(folder, (file, *([fleet.sitl.mission] if fleet.sitl.mission else [])))
+    mission = sitl_table(fleet).mission
+    run_files.refuse_inputs(folder, (file, *([mission] if mission is not None else [])))
     require_epoch(fleet.fleet, str(file), unix_s=time.time())
     keys = key_folder(fleet, file.parent)
     if fleet.security.mode == "signed":
@@ -180,9 +190,11 @@ def sitl_mission(config: FleetFile) -> None:
     from fleetloc.run.sitl_lines import MissionPrinter
     from sim_bridge.sitl.mission import load_mission
     from sim_bridge.sitl.pilot import fly_mission
+    from sim_bridge.sitl.sitl_table import sitl_table
 
     fleet = load_config(config)
-    if fleet.sitl.mission is None:
+    mission_file = sitl_table(fleet).mission
+    if mission_file is None:
         raise InputError(str(config), "sitl.mission", "a mission file", "none")
-    mission = load_mission(config.parent / fleet.sitl.mission, fleet)
+    mission = load_mission(config.parent / mission_file, fleet)
     asyncio.run(fly_mission(fleet, mission, MissionPrinter()))

@@ -16,6 +16,7 @@ from agent.config.tables import FleetConfig
 from estimators.model.layout import Layout, block, position
 from fleetloc.monitor.alarms import DroneFacts, alarms_of_drone, alarms_of_fleet
 from fleetloc.monitor.links import LinkHistory, link_view, overdue_s
+from fleetloc.monitor.monitor_table import monitor_table
 from fleetloc.monitor.views import Alarm, Drone, Ellipse, Level, Link, Picture, SeenBy, Tracks, Triple
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matrix
 from transport.messages.report_body import Diagnostics
@@ -63,8 +64,9 @@ class FleetPicture:
     """Takes in what a fleet sends, gives its `Picture`."""
 
     def __init__(self, config: FleetConfig) -> None:
-        monitor, period_s = config.monitor, config.fleet.period_s
+        monitor, period_s = monitor_table(config), config.fleet.period_s
         self._config = config
+        self._track_s = monitor.track_s
         self._stale_after_s = max(monitor.stale_after_s, 3 * period_s)
         self._lost_after_s = max(monitor.lost_after_s, 6 * period_s)
         self._heard = {agent_id: _Heard() for agent_id in config.ids}
@@ -91,7 +93,7 @@ class FleetPicture:
             return
         if not heard.track or now_s - heard.track[-1][0] >= 0.9 * TRACK_SPACING_S:  # ticks jitter
             heard.track.append((now_s, _position(estimate, sender)))
-        while heard.track and now_s - heard.track[0][0] > self._config.monitor.track_s:
+        while heard.track and now_s - heard.track[0][0] > self._track_s:
             heard.track.popleft()
 
     def on_diagnostics(self, diagnostics: Diagnostics, now_s: float) -> None:
@@ -114,7 +116,7 @@ class FleetPicture:
     def tracks(self) -> Tracks:
         """Where each drone said to have been."""
         points = {agent_id: [point for _, point in heard.track] for agent_id, heard in self._heard.items()}
-        return Tracks(track_s=self._config.monitor.track_s, spacing_s=TRACK_SPACING_S, points=points)
+        return Tracks(track_s=self._track_s, spacing_s=TRACK_SPACING_S, points=points)
 
     def at(self, now_s: float, unix_s: float) -> Picture:
         """The picture of a moment."""

@@ -15,6 +15,7 @@ from rich.live import Live
 from agent.config.tables import FleetConfig
 from fleetloc.monitor import table
 from fleetloc.monitor.listener import Listener
+from fleetloc.monitor.monitor_table import monitor_table
 from fleetloc.monitor.picture import FleetPicture
 from fleetloc.monitor.views import Picture
 from fleetloc.monitor.web import Board, WebServer
@@ -44,6 +45,7 @@ class Monitor:
     ) -> None:
         """Read keys and certificates; raises `SecurityError`, `KeyFileError`, `SettingsError`."""
         self._config = config
+        self._settings = monitor_table(config)
         self._web, self._terminal = web, terminal
         self._console = console or Console()
         self.picture = FleetPicture(config)
@@ -65,7 +67,7 @@ class Monitor:
         shower: asyncio.Task[None] | None = None
         try:
             if self._web:
-                where = self._config.monitor
+                where = self._settings
                 server = WebServer(where.host, where.port, self._board, self._tracks(loop))
                 server.start()
                 self._where = server.url
@@ -127,7 +129,7 @@ class Monitor:
             if self._terminal and time.monotonic() >= next_print_s:
                 next_print_s = time.monotonic() + terminal_period_s
                 print_(now)
-            await asyncio.sleep(self._config.monitor.refresh_s)
+            await asyncio.sleep(self._settings.refresh_s)
 
     def _print(self, picture: Picture) -> None:
         for line in table.lines(picture):

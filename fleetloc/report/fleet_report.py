@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from agent.config.reading import effective
 from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import rms
 from fleetloc.output import print_table, write_json
@@ -17,6 +18,7 @@ from fleetloc.report.fleet_results import Floats, Results, Track, load_results
 from fleetloc.report.report_html import page
 from fleetloc.run import run_files
 from fleetloc.run.fleet_run import Outcome
+from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
 SETTLED_S = 10.0
@@ -56,9 +58,9 @@ def report_figures(
             | _of_counters(lives)
         )
     return {
-        "config": msgspec.to_builtins(config),
+        "config": effective(config),
         "mode": mode,
-        "seed": config.sim.seed,
+        "seed": sim_table(config).seed,
         "duration_s": results.duration_s,
         "truth": "simulator",
         "agents": agents,

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
+from agent.config.reading import effective
 from estimators.model.layout import Layout
 from fleetloc.report.fleet_report import counted_packets, counted_sensors
 from fleetloc.run import run_files
@@ -80,7 +79,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
     names = names_apart(source.path for source in prepared.sources)
     agents = [_of_agent(prepared, replayed, results, agent_id) for agent_id in results.compared]
     return {
-        "config": msgspec.to_builtins(prepared.config),
+        "config": effective(prepared.config),
         "mode": "replay",
         "seed": prepared.seed,
         "from_s": inputs.from_s - zero_s,

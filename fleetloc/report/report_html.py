@@ -9,6 +9,7 @@ from typing import Any
 from agent.config.tables import FleetConfig
 from fleetloc.report import report_plots
 from fleetloc.report.fleet_results import Results
+from sim_bridge.world.sim_table import sim_table
 
 CSS = """
 body { font: 15px/1.45 system-ui, sans-serif; color: #1b1b1b; background: #fff; max-width: 1100px;
@@ -68,7 +69,7 @@ def _summary(config: FleetConfig, figures: dict[str, Any]) -> str:
     return (
         f"{len(config.agents)} drones, {figures['duration_s']:.0f} s {how}; {config.estimator.kind}, window "
         f"{config.estimator.window}, {config.estimator.rounds} round(s), {1 / config.fleet.period_s:g} Hz; world "
-        f"'{config.sim.profile}', seed {figures['seed']}; loss {config.transport.loss:g}, delay "
+        f"'{sim_table(config).profile}', seed {figures['seed']}; loss {config.transport.loss:g}, delay "
         f"{config.transport.delay_s:g} s"
     )
 

@@ -18,6 +18,7 @@ from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import average_nees_band
 from estimators.model.layout import STATES_PER_AGENT
 from fleetloc.report.fleet_results import Floats, Results, Track, unbroken
+from sim_bridge.world.sim_table import sim_table
 
 WIDTH_IN = 11.0
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f6000", "#444444")
@@ -96,7 +97,7 @@ def errors(config: FleetConfig, results: Results) -> Figure:
             axes.fill_between(when, -3 * sigma, 3 * sigma, color=colour(slot), alpha=0.18, linewidth=0)
             axes.plot(when, error, color=colour(slot), linewidth=0.8)
             axes.set(ylim=(-limits_m[axis], limits_m[axis]), xlim=(0, results.duration_s))
-            for outage in config.sim.gps_outages:
+            for outage in sim_table(config).gps_outages:
                 if outage.agent == track.agent_id:
                     axes.axvspan(outage.from_s, outage.to_s, color="#bbbbbb", alpha=0.35, linewidth=0)
         row[0].set_ylabel(f"drone {track.agent_id}\nm")

@@ -20,6 +20,7 @@ from fleetloc.run import live_table, run_files
 from fleetloc.run.fleet_observer import FleetObserver
 from fleetloc.run.live_truth import LiveTruth
 from fleetloc.run.processes import Child, cpu_time_s, resident_mb, stop_all
+from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
 START_TIMEOUT_S = 120.0
@@ -245,7 +246,7 @@ class FleetRun:
             for agent_id, daemon in self._daemons.items()
             if daemon.name in self._seen_dead
         }
-        title = f"{self._config.fleet.name}: {self._flown_s:.0f} of {self._config.sim.duration_s:.0f} s"
+        title = f"{self._config.fleet.name}: {self._flown_s:.0f} of {sim_table(self._config).duration_s:.0f} s"
         return title, live_table.rows(self._config, self._observer, self._truth, ended, time.monotonic())
 
     async def _show(self) -> None:

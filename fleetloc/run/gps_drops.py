@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Collection
 
-from agent.config.tables import GpsOutage
 from fleetloc.errors import InputError
 from sim_bridge.replay.what_if import OPTION, GpsDrop
+from sim_bridge.world.sim_table import GpsOutage
 
 FOR_EVER_S = 1e9
 

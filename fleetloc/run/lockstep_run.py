@@ -13,6 +13,7 @@ from fleetloc.output import progress_bar
 from fleetloc.run import run_files
 from fleetloc.run.fleet_run import Outcome
 from sim_bridge.virtual.fleet_lockstep import FleetLockstep
+from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
 
@@ -41,8 +42,9 @@ def fly_in_lockstep(config: FleetConfig, directory: Path) -> Outcome:
     gc.collect()
     gc.freeze()  # full collections over all modules would take a tenth of the time
     try:
-        with progress_bar("simulated seconds", int(config.sim.duration_s)) as advance:
-            report = run.run(config.sim.duration_s, lambda _time_s: advance())
+        duration_s = sim_table(config).duration_s
+        with progress_bar("simulated seconds", int(duration_s)) as advance:
+            report = run.run(duration_s, lambda _time_s: advance())
     finally:
         for recorder in recorders.values():
             recorder.close()

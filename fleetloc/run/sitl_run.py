@@ -16,6 +16,7 @@ from fleetloc.run.fleet_run import WATCH_S, Death, FleetRun, Outcome, RunFailed
 from fleetloc.run.processes import Child, stop_all
 from fleetloc.run.sitl_lines import ProgressLine, read_progress
 from sim_bridge.sitl.mission import load_mission
+from sim_bridge.sitl.sitl_table import sitl_table
 
 MISSION_LOG = "mission.log"
 AFTER_LANDING_S = 2.0
@@ -35,9 +36,10 @@ class SitlRun(FleetRun):
         )
         self._mission: Child | None = None
         self._mission_limit_s = 0.0
-        if config.sitl.mission is not None:
+        mission = sitl_table(config).mission
+        if mission is not None:
             self._mission = Child("mission", ("sitl-mission", file), out / MISSION_LOG, reads_stdout=True)
-            self._mission_limit_s = load_mission(Path(config.sitl.mission), config).limit_s
+            self._mission_limit_s = load_mission(Path(mission), config).limit_s
         self._ready = False
         self._failure: RunFailed | None = None
         self.mission_failure: str | None = None

@@ -16,9 +16,11 @@ from pathlib import Path
 from agent.config.tables import FleetConfig
 from sim_bridge.sitl.session import TimedTruth
 from sim_bridge.sitl.setup import vehicle_links
+from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.sitl.vehicle import SitlVehicle, VehicleReport
 from sim_bridge.sitl.world import SitlWorld
 from sim_bridge.world.range_sessions import open_range_sessions
+from sim_bridge.world.sim_table import sim_table
 from sim_bridge.world.simulator import PublishRanges, stop_signals
 from sim_bridge.world.truth import TruthError
 from sim_bridge.world.uwb_frames import UwbDrivers
@@ -69,6 +71,7 @@ class SitlBridge:
     def __init__(self, config: FleetConfig, world: SitlWorld, publish_ranges: PublishRanges) -> None:
         """Raises `ConfigError` for addresses that cannot be used."""
         self._config = config
+        self._sitl = sitl_table(config)
         self._world = world
         self._publish_ranges = publish_ranges
         self._drivers = UwbDrivers()
@@ -90,7 +93,7 @@ class SitlBridge:
         flown_s = time.monotonic() - start_s
         return any(
             outage.agent == agent_id and outage.from_s <= flown_s < outage.to_s
-            for outage in self._config.sim.gps_outages
+            for outage in sim_table(self._config).gps_outages
         )
 
     async def open(self) -> None:
@@ -123,7 +126,7 @@ class SitlBridge:
         return self.report()
 
     async def _simulators_there(self, stop: asyncio.Event, on_progress: OnProgress) -> None:
-        deadline_s = time.monotonic() + self._config.sitl.appear_timeout_s
+        deadline_s = time.monotonic() + self._sitl.appear_timeout_s
         told_s = float("-inf")
         while not stop.is_set():
             self._check_refusals()
@@ -132,7 +135,7 @@ class SitlBridge:
             if not missing:
                 return
             if now_s > deadline_s:
-                limit_s = self._config.sitl.appear_timeout_s
+                limit_s = self._sitl.appear_timeout_s
                 raise SimulatorAbsent(f"{'; '.join(missing)}; waited {limit_s:g} s: is it running there?")
             if now_s - told_s >= PROGRESS_S:
                 told_s = now_s
@@ -173,7 +176,7 @@ class SitlBridge:
             self._failed += not taken
 
     def _note_silence(self, now_s: float) -> None:
-        limit_s = self._config.sitl.silence_s
+        limit_s = self._sitl.silence_s
         for vehicle in self.vehicles:
             last = self._world.tracks[vehicle.agent_id].last
             if last is not None and now_s - last.host_s > limit_s:

@@ -17,6 +17,7 @@ from agent.mavlink.stream_rates import StreamRates
 from agent.mavlink.timesync import BootClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Triple
+from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.sitl.truth import TRUTH_MESSAGES, TrueSample, TruthTap, boot_time_s
 
 HEARTBEAT_S = 1.0
@@ -40,8 +41,9 @@ class SitlSession:
         self._system = config.system_id(agent_id)
         self._wanted_flavour = config.agent(agent_id).autopilot
         self._settings = config.mavlink
-        self._truth_hz = config.sitl.truth_hz
-        self._encoder = Encoder(self._system, config.sitl.component_id)
+        sitl = sitl_table(config)
+        self._truth_hz = sitl.truth_hz
+        self._encoder = Encoder(self._system, sitl.component_id)
         self.decoder = Decoder(datagrams=datagrams)
         self.tap = TruthTap(FleetFrame.of(config))
         self.clock = BootClock(config.mavlink.max_rtt_s)

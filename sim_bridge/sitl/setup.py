@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from agent.config.endpoints import SPELLINGS, Endpoint, LinkKind, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError, EndpointError
+from sim_bridge.sitl.sitl_table import sitl_table
 
 WHERE = "[sitl]"
 ARDUPILOT_TCP, ARDUPILOT_STEP = 5760, 10
@@ -56,18 +57,19 @@ def vehicle_links(config: FleetConfig) -> dict[int, VehicleLinks]:
 
 def _check_vehicles(config: FleetConfig) -> None:
     seen: set[int] = set()
-    for index, vehicle in enumerate(config.sitl.vehicles):
+    sitl = sitl_table(config)
+    for index, vehicle in enumerate(sitl.vehicles):
         key = f"vehicles[{index}].agent"
         if vehicle.agent not in config.ids:
             raise ConfigError(WHERE, key, f"ids of agents ({', '.join(map(str, config.ids))})", str(vehicle.agent))
         if vehicle.agent in seen:
             raise ConfigError(WHERE, key, "one entry per agent", f"a second one of agent {vehicle.agent}")
         seen.add(vehicle.agent)
-    last = config.sitl.client_port + len(config.ids) - 1
+    last = sitl.client_port + len(config.ids) - 1
     if last > 65535:
         raise ConfigError(WHERE, "client_port", "a port for each agent up to 65535", f"{last} for the last")
-    if config.sitl.component_id == config.mavlink.component_id:
-        found = f"{config.sitl.component_id} for both"
+    if sitl.component_id == config.mavlink.component_id:
+        found = f"{sitl.component_id} for both"
         raise ConfigError(WHERE, "component_id", "another id than mavlink.component_id, the daemon's", found)
 
 
@@ -79,7 +81,7 @@ def _check_height(config: FleetConfig) -> None:
 
 
 def _links(config: FleetConfig, agent_id: int, number: int) -> VehicleLinks:
-    vehicle = next((vehicle for vehicle in config.sitl.vehicles if vehicle.agent == agent_id), None)
+    vehicle = next((vehicle for vehicle in sitl_table(config).vehicles if vehicle.agent == agent_id), None)
     if vehicle is None:
         simulator, gcs = _default_simulator(config, agent_id, number), None
     else:
@@ -91,7 +93,7 @@ def _links(config: FleetConfig, agent_id: int, number: int) -> VehicleLinks:
     if daemon.kind not in (LinkKind.UDP_IN, LinkKind.UDP_OUT):
         expected = "udpin:HOST:PORT or udpout:HOST:PORT for the daemon (a simulator's address goes to sitl.vehicles)"
         raise ConfigError(WHERE, f"mavlink of agent {agent_id}", expected, str(daemon))
-    return VehicleLinks(agent_id, simulator, daemon, config.sitl.client_port + number, gcs)
+    return VehicleLinks(agent_id, simulator, daemon, sitl_table(config).client_port + number, gcs)
 
 
 def _default_simulator(config: FleetConfig, agent_id: int, number: int) -> Endpoint:

@@ -15,6 +15,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from sim_bridge.sitl.session import TimedTruth
+from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.world.guidance import default_path
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
@@ -68,11 +69,12 @@ class SitlWorld:
 
     def __init__(self, config: FleetConfig, unix_offset_s: float) -> None:
         """Raises `ScenarioError` for rates that cannot be had."""
+        sitl = sitl_table(config)
         self.scenario: Scenario = dataclasses.replace(
-            scenario_from_config(config), uwb_reach_m=config.sitl.uwb_reach_m
+            scenario_from_config(config), uwb_reach_m=sitl.uwb_reach_m
         )
         self.unix_offset_s = unix_offset_s
-        self.truth_hz = config.sitl.truth_hz
+        self.truth_hz = sitl.truth_hz
         self.tracks = {agent_id: VehicleTrack() for agent_id in config.ids}
         self._run: _Run | None = None
         self.stale_s = 0.0

@@ -2,20 +2,21 @@
 
 from __future__ import annotations
 
-from agent.config import tables as tables
+from agent.config.tables import AgentTable, FleetConfig
 from agent.sensing.frames import FleetFrame, gravity_mps2
 from sim_bridge.world.guidance import Circle, FigureEight, Path, Waypoints
 from sim_bridge.world.noise import FlavourName
 from sim_bridge.world.scenario import Interval, Scenario, Vehicle
+from sim_bridge.world.sim_table import CirclePath, FigureEightPath, PathTable, WaypointsPath, sim_table
 
 
-def scenario_from_config(config: tables.FleetConfig) -> Scenario:
+def scenario_from_config(config: FleetConfig) -> Scenario:
     """The scenario that ``[sim]`` and the fleet's tables describe.
 
     An autopilot given as ``auto`` is a PX4. Raises `ScenarioError` for what the simulator cannot
     do, e.g. a rate above its own.
     """
-    sim = config.sim
+    sim = sim_table(config)
     paths = {table.agent: _path(table) for table in sim.paths}
     return Scenario(
         vehicles=tuple(_vehicle(config, agent, paths.get(agent.id)) for agent in config.agents),
@@ -39,16 +40,16 @@ def scenario_from_config(config: tables.FleetConfig) -> Scenario:
     )
 
 
-def _vehicle(config: tables.FleetConfig, agent: tables.AgentTable, path: Path | None) -> Vehicle:
+def _vehicle(config: FleetConfig, agent: AgentTable, path: Path | None) -> Vehicle:
     flavour: FlavourName = "ardupilot" if agent.autopilot == "ardupilot" else "px4"
     return Vehicle(agent.id, flavour, config.system_id(agent.id), path)
 
 
-def _path(table: tables.Path) -> Path:
+def _path(table: PathTable) -> Path:
     match table:
-        case tables.WaypointsPath():
+        case WaypointsPath():
             return Waypoints(table.points_m, table.hold_s, table.repeat)
-        case tables.CirclePath():
+        case CirclePath():
             return Circle(table.center_m, table.radius_m, table.lap_s, table.phase_rad)
-        case tables.FigureEightPath():
+        case FigureEightPath():
             return FigureEight(table.center_m, table.length_m, table.width_m, table.lap_s, table.phase_rad)

@@ -18,6 +18,7 @@ from sim_bridge.autopilot.udp_autopilot import AutopilotPort, open_port
 from sim_bridge.world.range_sessions import open_range_sessions
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.scenario_config import scenario_from_config
+from sim_bridge.world.sim_table import sim_table
 from sim_bridge.world.simulation import Outputs, Simulation, aligned_start
 from sim_bridge.world.uwb_frames import UwbDrivers
 from transport.link.session_settings import SessionSettings
@@ -185,7 +186,7 @@ async def simulate(
     try:
         async with simulator.serve(links):
             with stop_signals(stop):
-                return await simulator.run(config.sim.duration_s if duration_s is None else duration_s, stop)
+                return await simulator.run(sim_table(config).duration_s if duration_s is None else duration_s, stop)
     finally:
         await sessions.close()
         if truth_file is not None and simulation.world.time_s > 0.0:

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config.reading import FleetConfig, config_from
+from agent.config.reading import config_from
+from agent.config.tables import FleetConfig
 from agent.core import AgentCore
 from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.outputs import EstimateReady, HealthChanged, Output, Send

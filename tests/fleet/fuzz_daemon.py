@@ -26,13 +26,14 @@ import zenoh
 from numpy.typing import NDArray
 
 from agent.config.endpoints import parse_endpoint
-from agent.config.reading import load_config
+from agent.config.reading import load_config, with_other_table
 from agent.config.tables import FleetConfig
 from fleetloc.output import print_table, write_json
 from fleetloc.report.fleet_results import Results, load_results
 from fleetloc.run import run_files
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from fleetloc.run.processes import resident_mb
+from sim_bridge.world.sim_table import sim_table
 from tests.fleet.fuzz_traffic import (
     CAPTURED_FOR_S,
     HEARD,
@@ -292,8 +293,8 @@ def late_packets(fleet: FleetProcess, agent_id: int) -> int:
 
 def quiet_results(config: FleetConfig, folder: Path, duration_s: float) -> Results:
     """The same world without an attack, in virtual time."""
-    replace = msgspec.structs.replace
-    quiet = replace(config, sim=replace(config.sim, duration_s=float(np.ceil(duration_s)) + 1.0))
+    sim = msgspec.structs.replace(sim_table(config), duration_s=float(np.ceil(duration_s)) + 1.0)
+    quiet = with_other_table(config, "sim", sim)
     folder.mkdir()
     fly_in_lockstep(quiet, folder)
     return load_results(quiet, folder)

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from agent.config.reading import FleetConfig, config_from
+from agent.config.reading import config_from
+from agent.config.tables import FleetConfig
 from tests.support.loopback_sitl import FRAME
 
 

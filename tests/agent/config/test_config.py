@@ -8,7 +8,6 @@ from pathlib import Path
 import pytest
 
 from agent.config.reading import config_from, dump, load_config, load_estimator_settings
-from agent.config.tables import CirclePath
 from agent.errors import ConfigError
 from estimators.settings import EstimatorSettings
 
@@ -23,15 +22,12 @@ def test_a_shipped_configuration_survives_dump_and_load(path: Path) -> None:
     assert config_from(tomllib.loads(dump(config)), "dump") == config
 
 
-def test_the_three_fleets_are_what_they_say() -> None:
-    line3, mesh5, gps_loss = (load_config(LINE3.with_stem(name)) for name in ("line3", "mesh5", "gps_loss"))
+def test_two_fleets_are_what_they_say() -> None:
+    line3, mesh5 = (load_config(LINE3.with_stem(name)) for name in ("line3", "mesh5"))
     assert line3.neighbours(2) == (1, 3)
     assert line3.neighbours(1) == (2,)
     assert line3.fleet.period_s == 0.1
     assert mesh5.neighbours(3) == (1, 2, 4, 5)
-    assert [outage.agent for outage in gps_loss.sim.gps_outages] == [4]
-    for config in (line3, mesh5, gps_loss):
-        assert {path.agent for path in config.sim.paths} == set(config.ids)
 
 
 def test_no_two_shipped_fleets_share_a_port() -> None:
@@ -56,16 +52,12 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         "estimator.kind=dekf_ci",
         "agents.2.mavlink=udpin:127.0.0.1:24552",
         'agents.2.name="two = 2"',
-        "sim.paths.1.radius_m=9.5",
         "record.directory=out",
         "transport.information_format=float32",
     ]
     config = load_config(LINE3, overrides)
     assert (config.estimator.window, config.estimator.kind) == (3, "dekf_ci")
     assert (config.agent(2).mavlink, config.agent(2).name) == ("udpin:127.0.0.1:24552", "two = 2")
-    path = config.sim.paths[0]
-    assert isinstance(path, CirclePath)
-    assert path.radius_m == 9.5
     assert config.record.directory == "out"
     assert config.transport.information_format == "float32"
 
@@ -97,11 +89,6 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         ("agents.1={}", "agents[0].id", "a value (the key is required)", "nothing"),
         ("fleet.edges=[[1,7]]", "fleet.edges[0]", "ids of agents (1, 2, 3)", "7"),
         ("fleet.edges=[[1,1]]", "fleet.edges[0]", "two different agents", "[1, 1]"),
-        ("sim.paths.1.kind=loop", "sim.paths[0].kind", "one of waypoints, circle, figure_eight", "'loop'"),
-        ("sim.paths.1.points_m=[]", "sim.paths[0].points_m", "one of kind, agent, center_m", "unknown"),
-        ("sim.paths.1.center_m=[1,2]", "sim.paths[0].center_m", "an array of length 3", "[1, 2]"),
-        ("sim.paths.1.agent=2", "sim.paths[1].agent", "one path per agent", "a second path of agent 2"),
-        ("sim.paths.1.agent=8", "sim.paths[0].agent", "ids of agents", "8"),
         ("transport.exchange_fraction=0.9", "transport.rounds_fraction", "at most 1 together", "1.3"),
         ("transport.guard_s=0.05", "transport.guard_s", "less than", "0.05"),
         ("agents.1.mavlink=tcpout:..bad:5760", "agents[0].mavlink", "tcpout:HOST:PORT", "host '..bad' is no address"),
@@ -132,11 +119,19 @@ def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
     assert str(caught.value).startswith(("override: ", str(LINE3)))
 
 
-def test_an_outage_must_end_after_it_begins() -> None:
+def test_tables_of_other_rooms_are_carried_along_and_nothing_in_them_is_refused() -> None:
     document = tomllib.loads(LINE3.read_text())
-    document["sim"]["gps_outages"] = [{"agent": 1, "from_s": 5.0, "to_s": 5.0}]
-    with pytest.raises(ConfigError, match=r"sim.gps_outages\[0\].to_s: expected later than from_s = 5.0"):
-        config_from(document, "here")
+    document["sim"] = {"duration_s": "for ever", "paths": 3}
+    config = config_from(document, "here")
+    assert config.others.tables == {"sim": document["sim"]}
+    assert tomllib.loads(dump(config))["sim"] == document["sim"]
+    assert load_config(LINE3, ["sim.duration_s=7"]).others.tables["sim"]["duration_s"] == 7
+
+
+def test_the_field_that_carries_them_is_no_table_of_the_file() -> None:
+    document = tomllib.loads(LINE3.read_text())
+    with pytest.raises(ConfigError, match=r"here: others: expected one of fleet, .*, sitl, monitor, found an"):
+        config_from(document | {"others": {}}, "here")
 
 
 def test_the_centralised_filter_is_for_studies_and_no_agents() -> None:

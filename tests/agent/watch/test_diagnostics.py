@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import pytest
 
-from agent.config.reading import FleetConfig
+from agent.config.tables import FleetConfig
 from agent.core import AgentCore
 from agent.watch.diagnostics import diagnostics_of
 from agent.watch.health import Facts, State, assess

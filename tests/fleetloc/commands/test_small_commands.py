@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.config.reading import load_config
 from fleetloc import cli
+from fleetloc.whole_config import load_whole
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 LINE3 = CONFIGS / "line3.toml"
@@ -24,7 +24,10 @@ def test_check_prints_what_is_in_effect(tmp_path: Path, capsys: pytest.CaptureFi
     assert cli.main(["check", str(LINE3), "--print", "--set", "estimator.window=3"]) == 0
     printed = tmp_path / "printed.toml"
     printed.write_text(capsys.readouterr().out)
-    assert load_config(printed) == load_config(LINE3, ["estimator.window=3"])
+    text = printed.read_text()
+    assert load_whole(printed) == load_whole(LINE3, ["estimator.window=3"])
+    assert "duration_s = 60.0" in text
+    assert "track_s = 60.0" in text
 
 
 @pytest.mark.parametrize("epoch_s", [0, 4_000_000_000])

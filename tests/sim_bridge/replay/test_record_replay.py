@@ -103,7 +103,7 @@ def test_another_configuration_says_what_would_have_been(flown: OnboardFleet) ->
 
 
 def test_a_configuration_without_the_agent_is_refused(flown: OnboardFleet) -> None:
-    config = msgspec.structs.replace(flown.config, agents=flown.config.agents[:2], sim=msgspec.UNSET)
+    config = msgspec.structs.replace(flown.config, agents=flown.config.agents[:2])
     with pytest.raises(RecordError, match=r"agent_003\.mcap: of agent 3, expected one of 1, 2"):
         repeat(flown, 3, config)
 

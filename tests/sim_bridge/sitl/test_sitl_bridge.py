@@ -14,7 +14,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from agent.config.endpoints import parse_endpoint
-from agent.config.reading import FleetConfig, config_from
+from agent.config.reading import config_from
+from agent.config.tables import FleetConfig
 from sim_bridge.autopilot.udp_autopilot import PortError
 from sim_bridge.sitl.bridge import Progress, SimulatorAbsent, SitlBridge, bridge
 from sim_bridge.sitl.setup import vehicle_links

@@ -12,7 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
-from agent.config.reading import ConfigError
+from agent.errors import ConfigError
 from agent.sensing.frames import FleetFrame
 from fleetloc.errors import InputError
 from fleetloc.run.gps_drops import gps_outage
@@ -22,6 +22,7 @@ from sim_bridge.sitl.mission import MissionError, load_mission
 from sim_bridge.sitl.ports import packed
 from sim_bridge.sitl.session import SitlSession, TimedTruth
 from sim_bridge.sitl.setup import vehicle_links
+from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.sitl.truth import TruthTap
 from sim_bridge.world.simulation import Simulation
 from tests.support.loopback_sitl import FRAME, grounded_fleet
@@ -194,7 +195,7 @@ def test_answers_to_the_daemon_are_not_taken_for_answers_to_the_bridge() -> None
     denied = mavlink.MAVLink_command_ack_message(511, 2, target_system=2, target_component=197)
     session.receive(bytes(denied.pack(ardupilot)), 10.1)
     assert session.refusal is None
-    denied.target_component = config.sitl.component_id
+    denied.target_component = sitl_table(config).component_id
     session.receive(bytes(denied.pack(ardupilot)), 10.2)
     assert "refuses SIM_STATE" in str(session.refusal)
 

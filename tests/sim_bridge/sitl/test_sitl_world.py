@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from agent.config.reading import FleetConfig
+from agent.config.tables import FleetConfig
 from sim_bridge.sitl.session import TimedTruth
 from sim_bridge.sitl.world import SitlWorld, smoothed_position
 from sim_bridge.world.truth import TruthError

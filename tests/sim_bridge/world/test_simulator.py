@@ -14,7 +14,8 @@ import pytest
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from agent.config.endpoints import parse_endpoint
-from agent.config.reading import FleetConfig, config_from
+from agent.config.reading import config_from
+from agent.config.tables import FleetConfig
 from sim_bridge.autopilot.udp_autopilot import MAX_DATAGRAM_BYTES, PortError, open_port
 from sim_bridge.world.range_sessions import range_session_settings
 from sim_bridge.world.scenario import ScenarioError, Vehicle

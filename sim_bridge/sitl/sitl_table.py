@@ -9,21 +9,27 @@ from typing import Annotated
 
 import msgspec
 
+from agent.config.fields import AgentId, Positive, Table
+from agent.config.reading import other_table
+from agent.config.tables import FleetConfig
 
-class SitlVehicle(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+NAME = "sitl"
+
+
+class SitlVehicleTable(Table, frozen=True):
     """``[[sitl.vehicles]]``: where the simulated autopilot of one agent is."""
 
-    agent: Annotated[int, msgspec.Meta(ge=1, le=999)]
+    agent: AgentId
     simulator: str
     """Address of its MAVLink link, e.g. ``tcp:127.0.0.1:5760`` or ``udpin:127.0.0.1:14540``."""
     gcs: str | None = None
     """A ground station that listens, e.g. ``udpin:127.0.0.1:14550``; it is sent to unasked."""
 
 
-class SitlTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):
+class SitlTable(Table, frozen=True):
     """``[sitl]``: what `fleetloc sitl` attaches to; no agent reads it."""
 
-    vehicles: tuple[SitlVehicle, ...] = ()
+    vehicles: tuple[SitlVehicleTable, ...] = ()
     """An agent that is absent has the n-th default port of its autopilot, n from 0 in order of the file:
     ArduPilot ``tcp:127.0.0.1:5760 + 10 n``, PX4 ``udpin:127.0.0.1:14540 + n``."""
     client_port: Annotated[int, msgspec.Meta(ge=1024, le=64_000)] = 14_590
@@ -32,11 +38,16 @@ class SitlTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only
     """MAVLink component id of the bridge; another one than the daemon's."""
     truth_hz: Annotated[float, msgspec.Meta(ge=5, le=200)] = 50.0
     """Rate at which the simulators' truth is asked for and recorded."""
-    uwb_reach_m: Annotated[float, msgspec.Meta(gt=0)] = 200.0
+    uwb_reach_m: Positive = 200.0
     """No ranges over longer distances."""
-    appear_timeout_s: Annotated[float, msgspec.Meta(gt=0)] = 60.0
+    appear_timeout_s: Positive = 60.0
     """All simulators have to show themselves within this."""
-    silence_s: Annotated[float, msgspec.Meta(gt=0)] = 5.0
+    silence_s: Positive = 5.0
     """A simulator that tells no truth for longer than this ends the run."""
     mission: str | None = None
     """File of the mission to fly, relative to the configuration file; absent = the bridge only watches."""
+
+
+def sitl_table(config: FleetConfig) -> SitlTable:
+    """The table of a fleet's configuration; raises `ConfigError`. `sim_bridge.sitl.setup` checks its addresses."""
+    return other_table(config, NAME, SitlTable)

@@ -1,0 +1,40 @@
+"""The ``[monitor]`` table: what `fleetloc monitor` shows, and where; no daemon reads it."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+import msgspec
+
+from agent.config.fields import NotNegative, Positive, Table
+from agent.config.reading import other_table
+from agent.config.tables import FleetConfig
+from agent.errors import ConfigError
+from transport.link.addresses import is_host
+
+NAME = "monitor"
+
+
+class MonitorTable(Table, frozen=True):
+    """``[monitor]``: what `fleetloc monitor` shows, and where; no daemon reads it."""
+
+    host: str = "127.0.0.1"
+    """Address of the web page; it has no password."""
+    port: Annotated[int, msgspec.Meta(ge=0, le=65_535)] = 8470
+    """0 = any free one."""
+    refresh_s: Annotated[float, msgspec.Meta(ge=0.05, le=2)] = 0.2
+    """The picture is renewed this often."""
+    stale_after_s: Positive = 1.0
+    """An estimate older than this (or than three periods) is shown as stale."""
+    lost_after_s: Positive = 2.0
+    """A drone silent for longer than this (or than six periods) is shown as lost; one that left, at once."""
+    track_s: NotNegative = 60.0
+    """Length of the tracks on the map."""
+
+
+def monitor_table(config: FleetConfig) -> MonitorTable:
+    """The table of a fleet's configuration; raises `ConfigError`."""
+    table = other_table(config, NAME, MonitorTable)
+    if not is_host(table.host):
+        raise ConfigError(config.others.where, "monitor.host", "an address to listen on", repr(table.host))
+    return table

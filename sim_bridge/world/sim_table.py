@@ -1,0 +1,105 @@
+"""The ``[sim]`` table: the simulated world; no agent reads it."""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+import msgspec
+
+from agent.config.fields import AgentId, NotNegative, Point, Positive, Seed, Table
+from agent.config.reading import other_table
+from agent.config.tables import FleetConfig
+from agent.errors import ConfigError
+
+NAME = "sim"
+
+
+class GpsOutage(Table, frozen=True):
+    """``[[sim.gps_outages]]``: one agent's receiver sees nothing for a while."""
+
+    agent: AgentId
+    from_s: NotNegative
+    to_s: Positive
+
+
+class WaypointsPath(Table, frozen=True, tag_field="kind", tag="waypoints"):
+    """Fly to the points in turn, each held for a while."""
+
+    agent: AgentId
+    points_m: Annotated[tuple[Point, ...], msgspec.Meta(min_length=1)]
+    hold_s: Positive = 10.0
+    """Time from one point to the next."""
+    repeat: bool = True
+
+
+class CirclePath(Table, frozen=True, tag_field="kind", tag="circle"):
+    """A horizontal circle, right-handed about down (clockwise from above)."""
+
+    agent: AgentId
+    center_m: Point
+    radius_m: Positive = 5.0
+    lap_s: Positive = 20.0
+    phase_rad: float = 0.0
+
+
+class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
+    """A horizontal Lissajous eight: north at the lap's frequency, east at twice that."""
+
+    agent: AgentId
+    center_m: Point
+    length_m: Positive = 10.0
+    """North-south extent."""
+    width_m: Positive = 5.0
+    """East-west extent."""
+    lap_s: Positive = 20.0
+    phase_rad: float = 0.0
+
+
+PathTable = WaypointsPath | CirclePath | FigureEightPath
+
+
+class SimTable(Table, frozen=True):
+    """``[sim]``: the simulated world; no agent reads it."""
+
+    seed: Seed = 1
+    profile: Literal["paper", "realistic"] = "paper"
+    """Noise: the paper's uniform one, or what real sensors look like."""
+    duration_s: Positive = 60.0
+    imu_hz: Annotated[float, msgspec.Meta(ge=10, le=1000)] = 100.0
+    attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
+    uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
+    max_accel_mps2: Positive = 2.0
+    """Commanded acceleration is clipped to this per axis."""
+    start_position_half_width_m: NotNegative = 15.0
+    """Starts are drawn uniformly from a cube about each path's start."""
+    start_speed_half_width_mps: NotNegative = 2.0
+    gps_outages: tuple[GpsOutage, ...] = ()
+    paths: tuple[PathTable, ...] = ()
+    """One per agent."""
+
+
+def sim_table(config: FleetConfig) -> SimTable:
+    """The table of a fleet's configuration, checked against its agents; raises `ConfigError`."""
+    table = other_table(config, NAME, SimTable)
+    _check(table, config)
+    return table
+
+
+def _check(table: SimTable, config: FleetConfig) -> None:
+    where = config.others.where
+    known = f"ids of agents ({', '.join(map(str, config.ids))})"
+    for index, outage in enumerate(table.gps_outages):
+        key = f"sim.gps_outages[{index}]"
+        if outage.agent not in config.ids:
+            raise ConfigError(where, f"{key}.agent", known, str(outage.agent))
+        if outage.to_s <= outage.from_s:
+            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
+    flown: set[int] = set()
+    for index, path in enumerate(table.paths):
+        key = f"sim.paths[{index}].agent"
+        if path.agent not in config.ids:
+            raise ConfigError(where, key, known, str(path.agent))
+        if path.agent in flown:
+            raise ConfigError(where, key, "one path per agent", f"a second path of agent {path.agent}")
+        flown.add(path.agent)

@@ -11,6 +11,8 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP_OPTIONS := --disable-pip-version-check --progress-bar off --quiet
 IS_NEW_ENOUGH := import sys; sys.exit(sys.version_info < (3, 11) and "fleetloc needs Python 3.11 or newer, found " + sys.version.split()[0] + "; choose one with: make PYTHON=python3.12")
+# what the tests need besides dev: every extra that a command can lack
+EXTRAS := report,studies,ulog,sitl
 DEMO_FOLDER := out/demo
 DEMO_SECONDS := 60
 
@@ -50,7 +52,7 @@ lock:
 	$(PYTHON) -c '$(IS_NEW_ENOUGH)'
 	rm -rf build/lock
 	$(PYTHON) -m venv build/lock
-	build/lock/bin/python -m pip install $(PIP_OPTIONS) '.[dev,compare,serial,ulog]'
+	build/lock/bin/python -m pip install $(PIP_OPTIONS) '.[dev,$(EXTRAS)]'
 	{ echo "# Every package of a working environment, pinned; made by make lock."; \
 	  build/lock/bin/python -m pip freeze --exclude fleetloc; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
@@ -61,7 +63,8 @@ lowest:
 	rm -rf build/lowest
 	$(PYTHON) -m venv build/lowest
 	$(PYTHON) -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-	  print(*p["dependencies"], *p["optional-dependencies"]["dev"], sep="\n")' | sed 's/>=/==/' > build/lowest.txt
+	  extras = p["optional-dependencies"]; \
+	  print(*p["dependencies"], *(each for name in "dev,$(EXTRAS)".split(",") for each in extras[name]), sep="\n")' | sort -u | sed 's/>=/==/' > build/lowest.txt
 	build/lowest/bin/python -m pip install $(PIP_OPTIONS) -r build/lowest.txt
 	build/lowest/bin/python -m pip install $(PIP_OPTIONS) --no-deps --editable .
 	build/lowest/bin/python -m pytest -n 2

@@ -6,7 +6,7 @@ Left out: what only developers and comparisons need. ``python dependencies.py py
 import sys
 import tomllib
 
-EXTRAS = ("serial", "ulog")
+EXTRAS = ("report", "ulog")
 
 with open(sys.argv[1], "rb") as file:
     project = tomllib.load(file)["project"]

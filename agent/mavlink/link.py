@@ -244,11 +244,8 @@ class SerialLink(MavlinkLink):
             raise _unusable(self.endpoint, error) from error
 
     def _open_device(self) -> None:
-        try:
-            import serial
-        except ImportError as error:
-            remedy = "pip install '.[serial]' in the checkout of fleetloc"
-            raise LinkError(f"{self.endpoint}: serial links need pyserial: {remedy}") from error
+        import serial  # only where there is a serial port: it takes time to load
+
         self._port = serial.Serial(self.endpoint.host, self.endpoint.port, timeout=0, write_timeout=0, exclusive=True)
         self.opened += 1
         self.peer = self.endpoint.host

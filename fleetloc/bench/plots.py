@@ -1,4 +1,4 @@
-"""The studies' plots as PNG files, drawn without a display."""
+"""The studies' plots as PNG files, drawn without a display; none where the plotting library is missing."""
 
 from __future__ import annotations
 
@@ -6,16 +6,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import matplotlib
 import numpy as np
-from matplotlib.axes import Axes
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from fleetloc.report.report_plots import COLOURS, STYLE
+from fleetloc.extras import is_installed
+from fleetloc.report.style import COLOURS, STYLE
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
     from fleetloc.bench.sweep import Flown
 
 PANELS = (
@@ -25,22 +25,28 @@ PANELS = (
 )
 
 
-def save(figure: Figure, folder: Path, name: str) -> Path:
-    """Write a figure as ``folder/name.png``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    path = folder / f"{name}.png"
-    figure.savefig(path, dpi=110)
-    return path
+def save(figure: Figure | None, folder: Path, name: str) -> None:
+    """Write a figure, where there is one, as ``folder/name.png``."""
+    if figure is not None:
+        folder.mkdir(parents=True, exist_ok=True)
+        figure.savefig(folder / f"{name}.png", dpi=110)
 
 
 def _figure(width_in: float, height_in: float) -> Figure:
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(width_in, height_in), layout="constrained")
     FigureCanvasAgg(figure)
     return figure
 
 
-def curves(flown: Sequence[Flown], label: str) -> Figure:
+def curves(flown: Sequence[Flown], label: str) -> Figure | None:
     """Errors and ANEES of all methods along an axis, with standard errors; one point per condition."""
+    if not is_installed("report"):
+        return None
+    import matplotlib
+
     with matplotlib.rc_context(STYLE):
         figure = _figure(13.0, 4.4)
         values = [float(each.point.value or 0.0) for each in flown]
@@ -67,8 +73,12 @@ def _curve(
 def islands(
     time_s: NDArray[np.float64], anees: Mapping[str, NDArray[np.float64]],
     disagreement: Mapping[str, NDArray[np.float64]], cut_s: tuple[float, float],
-) -> Figure:  # fmt: skip
+) -> Figure | None:  # fmt: skip
     """ANEES of each island and disagreement between them over time ``(T+1,)``; the partition is shaded."""
+    if not is_installed("report"):
+        return None
+    import matplotlib
+
     with matplotlib.rc_context(STYLE):
         figure = _figure(9.0, 6.0)
         above, below = figure.subplots(2, 1, sharex=True)

@@ -209,6 +209,7 @@ def partition(
 def _prepare(out: Path | None) -> Path | None:
     """Compile what is missing once, before several processes would wait for each other; make the folder."""
     from fleetloc.errors import InputError
+    from fleetloc.extras import is_installed, sentence
     from fleetloc.warmup import announce
 
     announce()
@@ -217,6 +218,8 @@ def _prepare(out: Path | None) -> Path | None:
             out.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise InputError("--out", "", "a folder that can be written", f"{out} ({error.strerror})") from None
+        if not is_installed("report"):
+            typer.echo(f"note: {sentence('report', 'no plots are drawn')}", err=True)
     return out
 
 

@@ -9,10 +9,12 @@ from typing import Any
 
 import msgspec
 import numpy as np
+import typer
 
 from agent.config.reading import effective
 from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import rms
+from fleetloc.extras import is_installed, sentence
 from fleetloc.output import print_table, write_json
 from fleetloc.report.fleet_results import Floats, Results, Track, load_results
 from fleetloc.report.report_html import page
@@ -37,6 +39,8 @@ def write_report(
         write_json(path, figures)
     (directory / run_files.REPORT_HTML).write_text(page(config, results, figures), encoding="utf-8")
     _print(figures)
+    if not is_installed("report"):
+        typer.echo(f"note: {sentence('report', f'{run_files.REPORT_HTML} has no plots')}")
     return figures
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 from html import escape
 from typing import Any
 
-from fleetloc.report import replay_plots
+from fleetloc.extras import is_installed, sentence
 from fleetloc.report.replay_figures import Results
 from fleetloc.report.replay_tables import cautions, error_table, log_table
 from fleetloc.report.report_html import CSS
-from fleetloc.report.report_plots import colour, packets
+from fleetloc.report.style import NO_PLOTS, colour
 from fleetloc.run.replay_run import Replayed
 from fleetloc.run.replay_setup import Prepared
 
@@ -40,7 +40,20 @@ def page(prepared: Prepared, sections: list[Section], figures: dict[str, Any]) -
 def drawn_sections(
     prepared: Prepared, replayed: Replayed, results: Results, figures: dict[str, Any]
 ) -> list[Section]:
-    """Tables and plots of a page, which is most of the work on it."""
+    """Tables and plots of a page, which is most of the work on it; tables only without the plotting library."""
+    tables = [
+        ("Errors", "In metres. Horizontal and whole errors of each drone's estimate of itself against the truth, per "
+         "part of the run; ANEES of the state of the fleet and of the own state: 1 is right, more is overconfident.",
+         _table(*error_table(figures))),
+        ("Logs", "Samples that were used, and content that was not, by reason.", _table(*log_table(figures))),
+    ]  # fmt: skip
+    return tables + _plots(prepared, replayed, results, figures) if is_installed("report") else tables
+
+
+def _plots(prepared: Prepared, replayed: Replayed, results: Results, figures: dict[str, Any]) -> list[Section]:
+    from fleetloc.report import replay_plots
+    from fleetloc.report.report_plots import packets
+
     config, inputs = prepared.config, prepared.inputs
     colours = {agent_id: colour(slot) for slot, agent_id in enumerate(config.ids) if agent_id in results.compared}
     series = [
@@ -54,10 +67,6 @@ def drawn_sections(
     latencies = {agent_id: thinned.table(3) for agent_id, thinned in replayed.latency.items()}
     has_truth = any(len(references.truth) for references in results.references.values())
     sections = [
-        ("Errors", "In metres. Horizontal and whole errors of each drone's estimate of itself against the truth, per "
-         "part of the run; ANEES of the state of the fleet and of the own state: 1 is right, more is overconfident.",
-         _table(*error_table(figures))),
-        ("Logs", "Samples that were used, and content that was not, by reason.", _table(*log_table(figures))),
         ("Where they were", "Colour: the fleet's estimate; black, dashed: the autopilot's own; grey: truth.",
          replay_plots.trajectories(series, span_s, colours)),
     ]  # fmt: skip
@@ -115,7 +124,9 @@ def _warnings(figures: dict[str, Any]) -> str:
         for drop in figures["gps_dropped"]
     ]
     sentences += cautions(figures)
-    return "".join(f'<p class="warning">{escape(sentence)}</p>\n' for sentence in sentences)
+    if not is_installed("report"):
+        sentences.append(sentence("report", NO_PLOTS))
+    return "".join(f'<p class="warning">{escape(each)}</p>\n' for each in sentences)
 
 
 def _table(columns: list[str], rows: list[list[str]]) -> str:

@@ -8,6 +8,7 @@ from typing import Any
 
 import typer
 
+from fleetloc.extras import is_installed, sentence
 from fleetloc.output import print_table, write_json
 from fleetloc.report.replay_figures import load_results, report_figures
 from fleetloc.report.replay_page import drawn_sections, page
@@ -41,5 +42,8 @@ def _print(figures: dict[str, Any]) -> None:
     title = "SYNTHETIC RANGES, made of the truth" if figures["synthetic_ranges"] else None
     print_table(*log_table(figures), title="logs: samples used, content skipped")
     print_table(*error_table(figures), title=title)
-    for sentence in cautions(figures):
-        typer.echo(f"note: {sentence}")
+    notes = list(cautions(figures))
+    if not is_installed("report"):
+        notes.append(sentence("report", f"{run_files.REPORT_HTML} has no plots"))
+    for note in notes:
+        typer.echo(f"note: {note}")

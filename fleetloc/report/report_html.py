@@ -1,4 +1,7 @@
-"""A run's page: one file, no network, readable in any browser and on paper."""
+"""A run's page: one file, no network, readable in any browser and on paper.
+
+Where the plotting library is missing it has the figures alone, and says so.
+"""
 
 from __future__ import annotations
 
@@ -7,8 +10,9 @@ from html import escape
 from typing import Any
 
 from agent.config.tables import FleetConfig
-from fleetloc.report import report_plots
+from fleetloc.extras import is_installed, sentence
 from fleetloc.report.fleet_results import Results
+from fleetloc.report.style import NO_PLOTS
 from sim_bridge.world.sim_table import sim_table
 
 CSS = """
@@ -37,7 +41,25 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 def page(config: FleetConfig, results: Results, figures: dict[str, Any]) -> str:
     """The whole page of a run; ``figures`` is the content of ``report.json``."""
     name, fleet = escape(config.fleet.name), figures["fleet"]
-    sections = [
+    body = "\n".join(
+        f'<h2>{title}</h2>\n<p class="note">{escape(note)}</p>\n{svg}'
+        for title, note, svg in _drawn(config, results, figures)
+    )
+    return (
+        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
+        f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
+        f'<p class="note">{escape(_summary(config, figures))}</p>\n{_warnings(fleet)}{_table(figures)}\n{body}\n'
+        "</body>\n</html>\n"
+    )
+
+
+def _drawn(config: FleetConfig, results: Results, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
+    """Title, note and SVG of each plot; none where the plotting library is missing."""
+    if not is_installed("report"):
+        return []
+    from fleetloc.report import report_plots
+
+    return [
         ("Where they were", "Truth pale and wide, each drone's own estimate thin on top; a dot marks the start.",
          report_plots.trajectories(results)),
         ("Position error and its 3-sigma band",
@@ -51,15 +73,6 @@ def page(config: FleetConfig, results: Results, figures: dict[str, Any]) -> str:
         ("Packets", "On the radio between drones. Lost: missing in the sequence numbers; injected losses included.",
          report_plots.packets(figures["agents"])),
     ]  # fmt: skip
-    body = "\n".join(
-        f'<h2>{title}</h2>\n<p class="note">{escape(note)}</p>\n{svg}' for title, note, svg in sections
-    )
-    return (
-        f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
-        f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
-        f'<p class="note">{escape(_summary(config, figures))}</p>\n{_warnings(fleet)}{_table(figures)}\n{body}\n'
-        "</body>\n</html>\n"
-    )
 
 
 def _summary(config: FleetConfig, figures: dict[str, Any]) -> str:
@@ -81,7 +94,9 @@ def _warnings(fleet: dict[str, Any]) -> str:
     behind_s = (fleet["simulator"] or {}).get("max_behind_s", 0.0)
     if behind_s > 0.1:
         sentences.append(f"the simulator was up to {behind_s:.2f} s behind the clock: the machine was overloaded")
-    return "".join(f'<p class="warning">{escape(sentence)}</p>\n' for sentence in sentences)
+    if not is_installed("report"):
+        sentences.append(sentence("report", NO_PLOTS))
+    return "".join(f'<p class="warning">{escape(each)}</p>\n' for each in sentences)
 
 
 def _table(figures: dict[str, Any]) -> str:

@@ -18,21 +18,10 @@ from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import average_nees_band
 from estimators.model.layout import STATES_PER_AGENT
 from fleetloc.report.fleet_results import Floats, Results, Track, unbroken
+from fleetloc.report.style import STYLE, colour
 from sim_bridge.world.sim_table import sim_table
 
 WIDTH_IN = 11.0
-COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f6000", "#444444")
-"""Told apart by most eyes (Okabe and Ito), then repeated."""
-STYLE: dict[Any, Any] = {
-    "font.size": 9.0,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "axes.grid": True,
-    "grid.color": "#e4e4e4",
-    "axes.axisbelow": True,
-    "legend.frameon": False,
-    "svg.hashsalt": "fleetloc",
-}
 Given = ParamSpec("Given")
 BAND = "95 % of a consistent estimator's samples"
 GAPS = 1.5
@@ -53,11 +42,6 @@ def styled(draw: Drawing[Given]) -> Callable[Given, str]:
             return _svg(draw(*args, **kwargs))
 
     return drawn
-
-
-def colour(slot: int) -> str:
-    """The colour of an agent in every plot."""
-    return COLOURS[slot % len(COLOURS)]
 
 
 @styled

@@ -54,8 +54,7 @@ def require_client() -> None:
         import mavsdk  # noqa: F401
     except ImportError as error:
         raise ClientMissing(
-            "flying a mission needs the MAVSDK client, expected the package mavsdk: "
-            "pip install '.[sitl]' in the checkout of fleetloc"
+            "a mission cannot be flown: mavsdk is not installed (pip install 'fleetloc[sitl]')"
         ) from error
 
 

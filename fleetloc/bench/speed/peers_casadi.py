@@ -8,7 +8,6 @@ timed.
 
 from __future__ import annotations
 
-import importlib.util
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -22,7 +21,7 @@ from estimators.model.motion import input_matrix, transition_matrix
 from estimators.window.types import WindowProblem
 from fleetloc.bench.speed.bounds import Bounds
 from fleetloc.bench.speed.plain_numpy import PlainModel, prior_moments
-from fleetloc.errors import EnvironmentFault
+from fleetloc.extras import require_extra
 
 TOLERANCE = 1e-9
 
@@ -67,10 +66,7 @@ SQP_OSQP: dict[str, Any] = {
 
 def require_casadi() -> Any:
     """The casadi module; raises `EnvironmentFault` where it is not installed."""
-    if importlib.util.find_spec("casadi") is None:
-        raise EnvironmentFault(
-            "casadi is not installed: bench speed needs it: pip install '.[compare]' in the checkout of fleetloc"
-        )
+    require_extra("studies", "bench speed has no solver to compare with")
     import casadi
 
     return casadi

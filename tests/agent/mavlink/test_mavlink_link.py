@@ -190,7 +190,6 @@ async def test_what_is_neither_name_nor_address_is_one_clear_line(kind: LinkKind
 
 
 async def test_a_serial_link_reads_writes_and_survives_unplugging(quick_reopen: None) -> None:
-    pytest.importorskip("serial", reason="serial links need the extra [serial]")
     master, slave = pty.openpty()
     tty.setraw(master)
     inbox = Inbox()

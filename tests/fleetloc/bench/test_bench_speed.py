@@ -37,7 +37,7 @@ COUNT = 2
 EPS = EstimatorSettings().norm_smoothing_m
 needs_casadi = pytest.mark.skipif(
     importlib.util.find_spec("casadi") is None,
-    reason="NOT TESTED: casadi is missing (pip install '.[compare]'), no peer checks our optimum",
+    reason="NOT TESTED: casadi is missing (pip install 'fleetloc[studies]'), no peer checks our optimum",
 )
 
 
@@ -266,7 +266,7 @@ def test_missing_casadi_is_one_line(
     error = capsys.readouterr().err
     assert error.count("\n") == 1
     assert "casadi is not installed" in error
-    assert "'.[compare]'" in error
+    assert "pip install 'fleetloc[studies]'" in error
 
 
 @pytest.mark.usefixtures("threads_restored")

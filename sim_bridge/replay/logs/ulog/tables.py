@@ -30,7 +30,7 @@ READ_AT_MOST = 8
 """Times the file's size."""
 CALL_BYTES = 4
 """What one call to read counts as, beside the bytes."""
-INSTALL = "pip install '.[ulog]' in the checkout of fleetloc"
+INSTALL = "pip install 'fleetloc[ulog]'"
 LONGEST_LOG_US = 24 * 3600 * 1_000_000
 _DAMAGE = (
     struct.error, ValueError, TypeError, IndexError, KeyError, AttributeError, EOFError, OverflowError, OSError,

@@ -1,8 +1,25 @@
-"""``python -m fleetloc``, for processes started by other processes."""
+"""The entry of the command, as ``fleetloc`` and as ``python -m fleetloc``.
+
+Looks whose packages would be imported before it imports any: see `fleetloc.shadowing`.
+"""
+
+from __future__ import annotations
 
 import sys
 
-from fleetloc.cli import main
+from fleetloc import shadowing
+
+
+def main() -> int:
+    """Run the command that was typed; returns the exit code, see `fleetloc.errors`."""
+    complaint = shadowing.complaint()
+    if complaint is not None:
+        print(f"fleetloc: error: {complaint}", file=sys.stderr)  # noqa: T201
+        return 3
+    from fleetloc import cli  # only now
+
+    return cli.main()
+
 
 if __name__ == "__main__":
     sys.exit(main())

@@ -20,8 +20,7 @@ import typer
 
 from fleetloc import commands
 from fleetloc.errors import BAD_INPUT, FAILED, INTERRUPTED, REFUSED
-
-ROOMS = ("estimators", "transport", "agent", "sim_bridge", "fleetloc")
+from fleetloc.shadowing import ROOMS
 
 
 def version() -> str:

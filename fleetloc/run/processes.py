@@ -11,6 +11,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 from fleetloc.errors import EnvironmentFault
+from fleetloc.shadowing import child_options
 
 GRACE_S = 8.0
 """After SIGTERM a child has this long to write its files; then it is killed."""
@@ -42,7 +43,7 @@ class Child:
         try:
             with self.log.open("wb") as log:
                 self.process = await asyncio.create_subprocess_exec(
-                    sys.executable, "-m", "fleetloc", *self._arguments,
+                    sys.executable, *child_options(), "-m", "fleetloc", *self._arguments,
                     stdin=asyncio.subprocess.DEVNULL, stdout=output, stderr=log, start_new_session=True,
                 )  # fmt: skip
         except OSError as error:

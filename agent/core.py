@@ -35,8 +35,11 @@ from agent.sensing.frames import gravity_mps2
 from agent.sensing.latency import GpsLatency
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.sensing.timeline import TickInput, Timeline, tick_of
-from agent.watch.health import Facts, HealthMonitor, gps_lost
+from agent.watch.health import HealthMonitor
+from agent.watch.position_watch import PositionWatch, TickEvidence
 from estimators.estimator import Estimate
+from estimators.integrity.solution import Solution
+from estimators.integrity.staleness import Ages, gps_lost
 from estimators.model.layout import Layout, block
 from transport.link.rounds import RoundBarrier
 from transport.messages.information_body import Information
@@ -72,6 +75,7 @@ class AgentCore:
         self.gps_latency = GpsLatency(self._period_s, config.sensors)
         self.records = RecordStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
+        self.watch = PositionWatch(config.transport.neighbour_timeout_s)
         self.health = HealthMonitor()
         self.counters: Counter[str] = Counter()
         self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters)
@@ -276,7 +280,7 @@ class AgentCore:
         own = block(present.index(self._agent_id))
         ready = EstimateReady(in_layout(estimate, present, self.layout), self._tick * self._period_s, now_s, on_time)
         message = estimate_message(estimate, present, own)
-        changed = self.health.update(self._facts(estimate, own, now_s), now_s)
+        changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)
         outputs += (ready, Send(message))  # nothing fails from here on: no tick has two estimates
         if changed is not None:
             outputs.append(HealthChanged(changed))
@@ -310,20 +314,24 @@ class AgentCore:
 
     # --- common --------------------------------------------------------------------------------------------
 
-    def _facts(self, estimate: Estimate, own: slice, now_s: float) -> Facts:
+    def _evidence(self, estimate: Estimate, own: slice, now_s: float) -> TickEvidence:
+        """What the monitors look at when an estimate of those who are present is out."""
         assert self._tick is not None
-        started = self.fleet.started
-        gps_age_s = self.gps_age_s(now_s)
-        near, directions = self.fleet.roll.anchors(self._agent_id, self._tick) if gps_lost(gps_age_s) else (0, 0)
-        return Facts(
-            status=estimate.status if started else None,
-            own_sigma_m=float(np.sqrt(estimate.covariance.diagonal()[own][:3].max())),
-            gps_age_s=gps_age_s,
-            imu_coverage=0.0 if self._input is None else self._input.coverage,
-            silent_neighbours=self.neighbours.silent(now_s),
+        started, fix_age_s, roll = self.fleet.started, self.gps_age_s(now_s), self.fleet.roll
+        alone = started and gps_lost(fix_age_s)  # nothing but ranges can hold the position
+        return TickEvidence(
+            Solution(
+                status=estimate.status if started else None,
+                own_sigma_m=float(np.sqrt(estimate.covariance.diagonal()[own][:3].max())),
+                waiting_for="" if started else "waiting for fixes",
+            ),
+            Ages(
+                fix_age_s=fix_age_s,
+                imu_coverage=0.0 if self._input is None else self._input.coverage,
+                heard_age_s=self.neighbours.expected_ages_s(now_s),
+            ),
             autopilot=self.autopilot_state,
-            waiting_for="" if started else "waiting for fixes",
-            located_neighbours=near,
-            directions=directions,
-            ambiguous=self.fleet.roll.ambiguous,
+            geometry=roll.geometry(self._agent_id, self._tick) if alone else None,
+            location=roll.own_location if alone else (),
+            timing=self.gps_latency.timing,
         )

@@ -18,6 +18,7 @@ from agent.outputs import Output
 from agent.sensing.clock import FleetClock, clock_fault
 from agent.uwb.adapter import UwbAdapter
 from agent.watch.health import State
+from agent.watch.position_watch import clock_finding
 from transport.messages.clock_body import ClockAnswer
 from transport.security.auth import Trust
 from transport.security.opening import Opener
@@ -174,7 +175,7 @@ class OnboardAgent:
     def _look_at_clock(self, host_s: float) -> None:
         """An estimate whose tick fits no packet reaches nobody: say so in the health."""
         fault = clock_fault(self._config.fleet, self.unix_s(host_s))
-        self.core.health.standing = () if fault is None else (fault,)
+        self.core.health.hold(clock_finding(fault))
 
     def _new_core(self) -> AgentCore:
         return AgentCore(self._config, self._agent_id, self._make_estimator)

@@ -18,8 +18,8 @@ from agent.config.reading import config_from, merged
 from agent.config.tables import FleetConfig, SensorsTable
 from agent.exit_codes import ExitCode
 from agent.uwb.adapter import UwbAdapter
-from agent.watch.health import Facts, State, assess
-from estimators.estimator import Status
+from agent.watch.health import assess
+from estimators.integrity.finding import Finding, Gravity, What
 from fleetloc.cli import build_app
 from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
@@ -227,39 +227,28 @@ def troubleshooting() -> str:
     return (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
 
 
-def facts(**changed: Any) -> Facts:
-    """Those of a drone that is well, but for what is changed."""
-    well: dict[str, Any] = {
-        "status": Status.OK, "own_sigma_m": 0.1, "gps_age_s": 0.1, "imu_coverage": 1.0, "silent_neighbours": (),
-        "autopilot": "connected", "located_neighbours": 3, "directions": 3,
-    }  # fmt: skip
-    return Facts(**(well | changed))
-
-
 @pytest.mark.parametrize(
-    "troubled",
+    "found",
     [
-        facts(status=None, waiting_for="waiting for fixes"),
-        facts(autopilot="searching"),
-        facts(autopilot="lost"),
-        facts(imu_coverage=0.5),
-        facts(gps_age_s=None),
-        facts(silent_neighbours=(2, 3)),
-        facts(own_sigma_m=6.0),
-        facts(own_sigma_m=60.0),
-        facts(gps_age_s=None, located_neighbours=2),
-        facts(gps_age_s=None, directions=2),
-        facts(gps_age_s=None, ambiguous=True),
-        facts(status=Status.FELL_BACK),
-        facts(status=Status.NO_DATA),
+        Finding(What.NO_ESTIMATE, Gravity.ABSENT, detail="waiting for fixes"),
+        Finding(What.FELL_BACK, Gravity.DEGRADED),
+        Finding(What.NO_DATA, Gravity.DEGRADED),
+        Finding(What.UNKNOWN, Gravity.UNUSABLE),
+        Finding(What.UNCERTAIN, Gravity.DEGRADED),
+        Finding(What.AMBIGUOUS, Gravity.ALARM),
+        Finding(What.TOO_FEW_RANGED, Gravity.ALARM, value=2, limit=3),
+        Finding(What.ONE_PLANE, Gravity.ALARM),
+        Finding(What.AUTOPILOT, Gravity.DEGRADED, detail="searching"),
+        Finding(What.AUTOPILOT, Gravity.DEGRADED, detail="lost"),
+        Finding(What.IMU_GAP, Gravity.DEGRADED),
+        Finding(What.NO_FIX, Gravity.DEGRADED),
+        (Finding(What.SILENT, Gravity.DEGRADED, 2), Finding(What.SILENT, Gravity.DEGRADED, 3)),
     ],
-    ids=lambda troubled: "",
+    ids=lambda found: "",
 )
-def test_every_reason_of_health_is_explained(troubled: Facts) -> None:
-    health = assess(troubled, State.OK)
-    assert health.reasons
-    for reason in health.reasons:
-        assert f"| `{reason}` |" in troubleshooting()
+def test_every_reason_of_health_is_explained(found: Finding | tuple[Finding, ...]) -> None:
+    (reason,) = assess(found if isinstance(found, tuple) else (found,)).reasons
+    assert f"| `{reason}` |" in troubleshooting()
 
 
 def test_the_reasons_of_refusal_that_are_explained_exist() -> None:

@@ -10,11 +10,10 @@ from agent.config.tables import FleetConfig
 from agent.fleet.motions import Motions
 from agent.sensing.samples import Triple
 from estimators.algorithms.membership import Prior
+from estimators.integrity.thresholds import FIX_MEMORY_TICKS
 from estimators.model.measurements import Matrix, Vector
 from transport.messages.measurement_body import PositionRecord, Record, VelocityRecord
 
-FRESH_TICKS = 30
-"""Fixes older than this say nothing about where a drone is now."""
 TRACK_FIXES = 20
 ENOUGH_FIXES = 10
 SPEED_SIGMA_MPS = 0.15
@@ -50,7 +49,7 @@ class FixTracks:
         A wide prior about the place, which is left to the fixes to come to say. The velocity is what these fixes tell
         of it by their slope, so that a speed or range is not linearised about a direction that nothing is known of.
         """
-        fixes = [fix for fix in self._fixes.get(agent_id, ()) if at_tick - FRESH_TICKS <= fix.tick < at_tick]
+        fixes = [fix for fix in self._fixes.get(agent_id, ()) if at_tick - FIX_MEMORY_TICKS <= fix.tick < at_tick]
         if self._count[agent_id] < self._settings.fixes or len(fixes) < 2:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)
@@ -64,7 +63,7 @@ class FixTracks:
         mean, covariance = self.prior(position, velocity)
         covariance[3:, 3:] = np.diag(speed_variance)
         measured = self._velocities.get(agent_id)
-        if measured is not None and abs(at_tick - measured.tick) <= FRESH_TICKS:
+        if measured is not None and abs(at_tick - measured.tick) <= FIX_MEMORY_TICKS:
             known = np.asarray(measured.variance_m2ps2) < speed_variance
             mean[3:][known] = np.asarray(measured.velocity_mps)[known]
             covariance[3:, 3:][np.diag(known)] = self._settings.speed_sigma_mps**2  # measured again in the window

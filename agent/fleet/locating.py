@@ -14,6 +14,9 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from agent.fleet.motions import MEMORY_TICKS, Motions
 from estimators.algorithms.membership import Prior
+from estimators.integrity.finding import Finding
+from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
+from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
 from transport.messages.measurement_body import RangeRecord, Record
@@ -21,10 +24,6 @@ from transport.messages.measurement_body import RangeRecord, Record
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
 MIN_RANGES = 4
-FRESH_TICKS = 5
-"""Without a range younger than this before the reference there is nothing to hold the drone there."""
-MAX_SIGMA_M = 1.5
-"""A place less sure than this along its worst direction is none."""
 CORRELATED = 4.0
 """On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
 
@@ -41,8 +40,9 @@ class RangeLocator:
         self._ranges: deque[RangeRecord] = deque(maxlen=4096)
         self._motions = motions
         self._known: dict[int, _Known] = {}
-        self.ambiguous: set[int] = set()
-        """Drones whose ranges leave more than one place, as of the last attempt."""
+        self._monitor = RangeLocationMonitor()
+        self.findings: dict[int, tuple[Finding, ...]] = {}
+        """Why a drone's ranges did not locate it, as of the last attempt."""
 
     def note(self, record: Record) -> None:
         """Take in a record, own or heard."""
@@ -61,14 +61,11 @@ class RangeLocator:
     def place(self, agent_id: int, at_tick: int) -> Prior | None:
         """The prior of a drone at a tick from its ranges before that tick; ``None`` if they leave it open."""
         found = self._fit(agent_id, at_tick)
-        self.ambiguous.discard(agent_id)
-        if found is None or not found.fits:
+        self.findings[agent_id] = ()
+        if found is None:
             return None
-        if len(found.rivals):
-            self.ambiguous.add(agent_id)
-        if len(found.rivals) or found.sigma_m > MAX_SIGMA_M:
-            return None
-        return found.mean, CORRELATED * found.covariance
+        self.findings[agent_id] = self._monitor.observe(RangeLocation(found.fits, len(found.rivals), found.sigma_m))
+        return None if self.findings[agent_id] else (found.mean, CORRELATED * found.covariance)
 
     def _fit(self, agent_id: int, at_tick: int) -> Place | None:
         usable = [
@@ -80,7 +77,7 @@ class RangeLocator:
         ]
         usable.sort(key=lambda each: each[0].tick)
         usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
-        if len(usable) < MIN_RANGES or at_tick - usable[-1][0].tick > FRESH_TICKS:
+        if len(usable) < MIN_RANGES or at_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)
         count = dict.fromkeys((other for _, other, _ in usable), 0)

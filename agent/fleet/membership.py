@@ -21,6 +21,9 @@ from agent.fleet.locating import RangeLocator
 from agent.fleet.motions import Motions
 from estimators.algorithms.membership import Prior, marginal_pair, silence_sigma_m
 from estimators.estimator import Estimate
+from estimators.integrity.finding import Finding
+from estimators.integrity.range_geometry import GeometryMonitor, RangeGeometry
+from estimators.integrity.thresholds import HELD_SIGMA_M, RANGED_TICKS, TOLD_SIGMA_M
 from estimators.model.layout import STATES_PER_AGENT, block, position
 from estimators.model.measurements import Vector
 from transport.messages.estimate_body import MAX_AGE_TICKS
@@ -29,17 +32,8 @@ from transport.messages.measurement_body import AccelerationRecord, RangeRecord,
 
 ATTEMPT_EVERY_TICKS = 3
 """Places by ranges are sought this often: an attempt takes some milliseconds."""
-TOLD_SIGMA_M = 3.0
-"""A neighbour's pair locates a drone that it knows at least this well."""
 INFORMED_SHARE = 0.25
 """A position this much surer than silence would have left it has been spoken of on the way."""
-HELD_SIGMA_M = 1.5
-"""A drone less well known is not held by ranges: they would be linearised where it is not."""
-RANGED_TICKS = 10
-"""A range older than this holds a drone no longer, nor does one to a drone that has been silent for longer."""
-DIRECTIONS = 3
-MIN_SPREAD = 0.03
-"""Of the directions of ranges: smallest share of their squares along an axis for it to count (about 10 degrees)."""
 
 
 def is_absent(age_ticks: NDArray[np.integer[Any]]) -> NDArray[np.bool_]:
@@ -62,6 +56,7 @@ class Roll:
         self._motions = Motions(config)
         self._tracks = FixTracks(config, self._motions)
         self._locator = RangeLocator(config, self._motions)
+        self._geometry = GeometryMonitor()
         self._heard: dict[int, int] = {}
         self._ranged: dict[tuple[int, int], int] = {}
         """Tick of the last range, by the ids of its ends."""
@@ -80,9 +75,9 @@ class Roll:
         return self.members if self.own_located else tuple(a for a in self.members if a != self._agent_id)
 
     @property
-    def ambiguous(self) -> bool:
-        """Whether the own ranges leave more than one place."""
-        return not self.own_located and self._agent_id in self._locator.ambiguous
+    def own_location(self) -> tuple[Finding, ...]:
+        """Why the own ranges did not locate this drone, while it is not located."""
+        return () if self.own_located else self._locator.findings.get(self._agent_id, ())
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -131,7 +126,7 @@ class Roll:
         for agent in self.members:
             silent = estimate.tick - self._heard.get(agent, -math.inf) > RANGED_TICKS
             near = self._sigma_m[agent] < HELD_SIGMA_M
-            if silent and near and self.anchors(agent, estimate.tick)[1] == DIRECTIONS:
+            if silent and near and not self._geometry.observe(self.geometry(agent, estimate.tick)):
                 self._held[agent] = max(t for pair, t in self._ranged.items() if agent in pair)
 
     def usable(self, tick: int) -> tuple[int, ...]:
@@ -180,25 +175,17 @@ class Roll:
         """Undo a change that was not estimated with: who joined then has to be located again."""
         self.members, self.own_located = members, own_located
 
-    def anchors(self, agent: int, tick: int) -> tuple[int, int]:
-        """Located drones that a drone is ranged to, and how many directions of space (0..3) these ranges hold.
-
-        Only who is heard itself holds another.
-        """
+    def geometry(self, agent: int, tick: int) -> RangeGeometry:
+        """A drone and the located drones that it is ranged to; only who is heard itself holds another."""
+        if agent not in self._places:
+            return RangeGeometry.of(np.zeros(3), np.empty((0, 3)), np.empty(0))
         near = [
-            self._places[other]
+            (self._places[other], float(tick - min(self._heard.get(other, -math.inf), when)))
             for other in self.located
-            if other != agent
-            and other in self._places
-            and tick - self._heard.get(other, -math.inf) <= RANGED_TICKS
-            and tick - self._ranged.get(_pair(agent, other), -math.inf) <= RANGED_TICKS
+            if other in self._places and (when := self._ranged.get(_pair(agent, other))) is not None
         ]
-        if agent not in self._places or not near:
-            return 0, 0
-        away = np.array(near) - self._places[agent]
-        units = away / np.maximum(np.linalg.norm(away, axis=1), 1e-6)[:, None]
-        spread = np.linalg.eigvalsh(units.T @ units)
-        return len(near), int(np.count_nonzero(spread > MIN_SPREAD))
+        places = np.array([place for place, _ in near]).reshape(-1, 3)
+        return RangeGeometry.of(self._places[agent], places, np.array([age for _, age in near]))
 
     def _place(self, agent: int, tick: int, at_tick: int) -> Prior | None:
         heard = tick - self._heard.get(agent, -math.inf) <= RANGED_TICKS

@@ -62,16 +62,15 @@ class NeighbourTable:
         """Neighbours whose information a round waits for."""
         return frozenset(a for a, n in self._table.items() if self._is_recent(n.informed_s, now_s))
 
-    def silent(self, now_s: float) -> tuple[int, ...]:
-        """Neighbours that should be heard and are not: those of the edges, else those that fell silent of late."""
-        silent = ((a, n) for a, n in self._table.items() if not self._is_recent(n.heard_s, now_s))
-        return tuple(agent for agent, neighbour in silent if self._missed(neighbour, now_s))
+    def expected_ages_s(self, now_s: float) -> dict[int, float]:
+        """Time since each who should be heard was: the ends of the edges, else who was of late; ``inf``: never."""
+        return {a: now_s - n.heard_s for a, n in self._table.items() if self._is_expected(n, now_s)}
 
     def ages_s(self, now_s: float) -> dict[int, float]:
         """Time since each neighbour was heard, those never heard left out."""
         return {a: now_s - n.heard_s for a, n in self._table.items() if n.heard_s > -math.inf}
 
-    def _missed(self, neighbour: _Neighbour, now_s: float) -> bool:
+    def _is_expected(self, neighbour: _Neighbour, now_s: float) -> bool:
         last_s = max(neighbour.heard_s, neighbour.left_s)
         return not self._by_reach or now_s - last_s <= self._absent_after_s
 

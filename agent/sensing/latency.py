@@ -15,7 +15,8 @@ from typing import Literal
 from agent.config.tables import SensorsTable
 from agent.sensing.samples import GpsSample, LatencyPrior
 from agent.sensing.timeline import TickInput
-from estimators.calibration.latency import AccelerationHistory, Fix, LatencyEstimator
+from estimators.calibration.latency import AccelerationHistory, Fix, LatencyEstimator, Outcome
+from estimators.integrity.latency_doubt import FixTiming
 
 Stamp = Literal["boot", "utc", "arrival"]
 """What the time of a fix is: the autopilot's boot clock, the receiver's UTC, or the arrival of the message."""
@@ -79,6 +80,8 @@ class GpsLatency:
         self._current: LatencyPrior | None = None
         self._history = AccelerationHistory(KEEP_S)
         self._accel_mps2 = 0.0
+        self.timing: FixTiming | None = None
+        """How well it is known when the latest fix was taken; ``None`` before the first."""
         self.counters: Counter[str] = Counter()
 
     @property
@@ -104,10 +107,12 @@ class GpsLatency:
                 self._sources[prior] = _Source(LatencyEstimator(prior.latency_s, prior.sigma_s, self._history))
             self._sources[prior].waiting.append(_fix(sample))
         latency_s, sigma_s = self._known(prior)
+        speed_mps = self._speed_mps(sample)
+        self.timing = FixTiming(sigma_s, speed_mps, sample.horizontal_sigma_m, refused=False)
         return replace(
             sample,
             t_s=sample.t_s - latency_s,
-            horizontal_sigma_m=math.hypot(sample.horizontal_sigma_m, self._speed_mps(sample) * sigma_s),
+            horizontal_sigma_m=math.hypot(sample.horizontal_sigma_m, speed_mps * sigma_s),
             speed_sigma_mps=math.hypot(sample.speed_sigma_mps, self._accel_mps2 * sigma_s),
         )
 
@@ -117,17 +122,21 @@ class GpsLatency:
         self._accel_mps2 = math.hypot(north, east)
         start_s = closed.tick * self._period_s
         self._history.add(start_s, start_s + self._period_s, (north, east), closed.variance[0])
+        refused = False
         for source in self._sources.values():
             while source.waiting and source.estimator.ready(source.waiting[0].stamp_s):
-                self._estimate(source.estimator, source.waiting.popleft())
+                refused |= self._estimate(source.estimator, source.waiting.popleft()) is Outcome.REJECTED
+        if self.timing is not None:
+            self.timing = replace(self.timing, refused=refused)
 
-    def _estimate(self, estimator: LatencyEstimator, fix: Fix) -> None:
+    def _estimate(self, estimator: LatencyEstimator, fix: Fix) -> Outcome | None:
         try:
             outcome = estimator.update(fix)
         except ValueError:  # not finite, or out of order
             self.counters["unusable"] += 1
-        else:
-            self.counters[outcome.name.lower()] += 1
+            return None
+        self.counters[outcome.name.lower()] += 1
+        return outcome
 
     def _known(self, prior: LatencyPrior) -> tuple[float, float]:
         source = self._sources.get(prior)

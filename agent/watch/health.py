@@ -1,19 +1,16 @@
-"""How an agent is: one state, the reasons for it, and when it changed. Sans-I/O."""
+"""How an agent is, in words: one state, the reasons for it, and when it changed. Sans-I/O.
+
+Nothing is judged here: state and reasons follow from what the monitors found (`agent.watch.position_watch`).
+"""
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Iterable
+from dataclasses import dataclass
 from enum import StrEnum
 
-from estimators.estimator import Status
+from estimators.integrity.finding import Finding, Gravity, What
 
-GPS_LOST_S = 1.5
-MIN_IMU_COVERAGE = 0.9
-DEGRADED_SIGMA_M = 5.0
-FAULT_SIGMA_M = 50.0
-ALIGNED_SIGMA_M = 2.0
-DIRECTIONS = 3
-"""Neighbours, and directions to them, that hold a drone without GPS."""
 MAX_NAMED = 8
 """Silent neighbours named in a reason; of more, their number."""
 REPORT_PERIOD_S = 1.0
@@ -34,30 +31,38 @@ class State(StrEnum):
     """Not to be used."""
 
 
-@dataclass(frozen=True, slots=True)
-class Facts:
-    """What the state follows from; ``None`` where there is nothing to be said yet."""
-
-    status: Status | None
-    """Of the latest estimate; ``None`` before the start."""
-    own_sigma_m: float
-    """Largest 1-sigma of the own position's axes."""
-    gps_age_s: float | None
-    """Since the last own fix."""
-    imu_coverage: float
-    """Share of the latest tick that the IMU vouches for."""
-    silent_neighbours: tuple[int, ...]
-    """Configured neighbours not heard of lately."""
-    autopilot: str
-    """State of the autopilot's link."""
-    waiting_for: str = ""
-    """What the start waits for."""
-    located_neighbours: int = 0
-    """Neighbours whose place is known and which are ranged; of interest, and counted, without GPS only."""
-    directions: int = 0
-    """Directions of space (0..3) that the ranges to them hold: less than 3 where all lie in one plane with us."""
-    ambiguous: bool = False
-    """Whether the ranges leave more than one place."""
+_STATES = {
+    Gravity.NOTED: State.OK,
+    Gravity.DEGRADED: State.DEGRADED,
+    Gravity.ALARM: State.DEGRADED,
+    Gravity.NOT_YET: State.ALIGNING,
+    Gravity.UNUSABLE: State.FAULT,
+    Gravity.ABSENT: State.INIT,
+}
+_UNOBSERVABLE = (What.AMBIGUOUS, What.TOO_FEW_RANGED, What.ONE_PLANE, What.MIRRORED, What.NOT_OBSERVABLE)
+"""Of these the first that was found is told: the later ones follow from it, or say the same less exactly."""
+_TEXTS = {
+    What.CLOCK: "{0.detail}",
+    What.NO_ESTIMATE: "{0.detail}",
+    What.NOT_ALIGNED: "",
+    What.FELL_BACK: "estimate fell back",
+    What.NO_DATA: "estimate no data",
+    What.UNKNOWN: "position unknown",
+    What.UNCERTAIN: "position uncertain",
+    What.AMBIGUOUS: "not observable: the ranges leave more than one place",
+    What.TOO_FEW_RANGED: "not observable: ranges to {0.value:.0f} of {0.limit:.0f} located neighbours",
+    What.ONE_PLANE: "not observable: all located neighbours in one plane",
+    What.MIRRORED: "not observable",
+    What.NOT_OBSERVABLE: "not observable",
+    What.CONTRADICTORY: "no place explains the measurements",
+    What.AUTOPILOT: "autopilot {0.detail}",
+    What.IMU_GAP: "IMU incomplete",
+    What.NO_FIX: "no GPS",
+    What.SILENT: "not heard: {0}",
+    What.LATENCY: "latency of GPS not known",
+    What.FIX_REFUSED: "fix refused",
+}
+"""Fields are those of the finding; of the silent neighbours, their ids."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -74,70 +79,32 @@ class Health:
         return f"{state}: {'; '.join(self.reasons)}" if self.reasons else state
 
 
-def assess(facts: Facts, was: State) -> Health:
-    """The health that follows from facts; ``was`` the state before, since alignment is done once."""
-    unheld = _unheld(facts)
-    health = _assess(facts, was, (*unheld, *_missing(facts)))
-    return replace(health, alarm=True) if unheld else health
+def assess(findings: Iterable[Finding]) -> Health:
+    """The health that follows from findings; its reasons in their order."""
+    told = [finding for finding in findings if finding.gravity > Gravity.NOTED]
+    gravest = max((finding.gravity for finding in told), default=Gravity.NOTED)
+    alarm = any(finding.gravity is Gravity.ALARM for finding in told)
+    return Health(_STATES[gravest], _reasons(told), alarm)
 
 
-def _unheld(facts: Facts) -> tuple[str, ...]:
-    """Why the own position cannot be observed; empty if it can, or nothing is estimated yet."""
-    if facts.status is None or not gps_lost(facts.gps_age_s):
-        return ("not observable",) if facts.status is Status.NOT_OBSERVABLE else ()
-    if facts.ambiguous:
-        return ("not observable: the ranges leave more than one place",)
-    if facts.located_neighbours < DIRECTIONS:
-        return (f"not observable: ranges to {facts.located_neighbours} of {DIRECTIONS} located neighbours",)
-    if facts.directions < DIRECTIONS:
-        return ("not observable: all located neighbours in one plane",)
-    return ("not observable",) if facts.status is Status.NOT_OBSERVABLE else ()
+def _reasons(findings: list[Finding]) -> tuple[str, ...]:
+    """In words, the silent neighbours together in one reason."""
+    unobservable = [what for what in _UNOBSERVABLE if any(finding.what is what for finding in findings)]
+    silent = [finding.about for finding in findings if finding.what is What.SILENT and finding.about is not None]
+    reasons = [
+        _TEXTS[finding.what].format(finding)
+        for finding in findings
+        if finding.what is not What.SILENT and finding.what not in unobservable[1:]
+    ]
+    if silent:
+        reasons.append(_TEXTS[What.SILENT].format(_listed(silent)))
+    return tuple(reason for reason in reasons if reason)
 
 
-def _assess(facts: Facts, was: State, missing: tuple[str, ...]) -> Health:
-    if facts.status is None:
-        return Health(State.INIT, (facts.waiting_for, *missing) if facts.waiting_for else missing)
-    if facts.own_sigma_m > FAULT_SIGMA_M and was not in (State.INIT, State.ALIGNING):
-        return Health(State.FAULT, ("position unknown", *missing))
-    if was in (State.INIT, State.ALIGNING) and facts.own_sigma_m > ALIGNED_SIGMA_M:
-        return Health(State.ALIGNING, missing)
-    reasons = list(missing)
-    if facts.own_sigma_m > DEGRADED_SIGMA_M:
-        reasons.insert(0, "position uncertain")
-    if facts.status in (Status.FELL_BACK, Status.NO_DATA):
-        reasons.insert(0, f"estimate {facts.status.name.lower().replace('_', ' ')}")
-    return Health(State.DEGRADED if reasons else State.OK, tuple(reasons))
-
-
-def _missing(facts: Facts) -> tuple[str, ...]:
-    reasons = []
-    if facts.autopilot != "connected":
-        reasons.append(f"autopilot {facts.autopilot}")
-    if facts.imu_coverage < MIN_IMU_COVERAGE:
-        reasons.append("IMU incomplete")
-    if gps_lost(facts.gps_age_s):
-        reasons.append("no GPS")
-    if facts.silent_neighbours:
-        reasons.append(f"not heard: {_listed(facts.silent_neighbours)}")
-    return tuple(reasons)
-
-
-def _listed(agents: tuple[int, ...]) -> str:
+def _listed(agents: list[int]) -> str:
     """Ids, of many the first ones: a reason has to fit into a packet."""
     named = ", ".join(map(str, agents[:MAX_NAMED]))
     return named if len(agents) <= MAX_NAMED else f"{named}, ... and {len(agents) - MAX_NAMED} more"
-
-
-def gps_lost(gps_age_s: float | None) -> bool:
-    """Whether a drone has to do without GPS, by the time since its last fix (``None``: there was none)."""
-    return gps_age_s is None or gps_age_s > GPS_LOST_S
-
-
-def _with_standing(health: Health, standing: tuple[str, ...]) -> Health:
-    if not standing:
-        return health
-    state = State.DEGRADED if health.state is State.OK else health.state
-    return replace(health, state=state, reasons=(*standing, *health.reasons))
 
 
 class HealthMonitor:
@@ -146,14 +113,17 @@ class HealthMonitor:
     def __init__(self) -> None:
         self.health = Health(State.INIT, ())
         self.changes = 0
-        self.standing: tuple[str, ...] = ()
-        """Reasons that do not follow from the facts; set by the owner."""
+        self._held: tuple[Finding, ...] = ()
         self._reported = self.health
         self._next_report_s = float("-inf")
 
-    def update(self, facts: Facts, now_s: float) -> Health | None:
-        """Take in facts; the health if there is a change to be reported now."""
-        health = _with_standing(assess(facts, self.health.state), self.standing)
+    def hold(self, findings: tuple[Finding, ...]) -> None:
+        """Findings that no tick brings, as of the clock: they come first in what follows, until others are held."""
+        self._held = findings
+
+    def update(self, findings: tuple[Finding, ...], now_s: float) -> Health | None:
+        """Take in what a tick brought; the health if there is a change to be reported now."""
+        health = assess((*self._held, *findings))
         self.changes += health != self.health
         self.health = health
         if health == self._reported or now_s < self._next_report_s:

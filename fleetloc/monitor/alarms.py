@@ -8,8 +8,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
-from agent.watch.health import GPS_LOST_S
 from estimators.estimator import Status
+from estimators.integrity.thresholds import GPS_LOST_S
 from fleetloc.monitor.views import Drone, Level
 from transport.messages.report_body import Diagnostics
 

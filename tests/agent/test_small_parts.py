@@ -1,4 +1,4 @@
-"""The fleet clock, the health, the record, the start: small parts that everything stands on."""
+"""The fleet clock, the record, the start: small parts that everything stands on."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady, estimate_message
 from agent.sensing.clock import FleetClock, require_epoch
 from agent.warmup import warm_up
-from agent.watch.health import Facts, Health, HealthMonitor, State, assess
+from agent.watch.health import State
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
 from transport.security.auth import UNSIGNED
@@ -89,90 +89,6 @@ def test_the_health_says_while_ticks_fit_no_packet(make_config: MakeConfig) -> N
     for step in range(20):
         onboard.advance(1.0 + 0.05 * step)
     assert not [reason for reason in onboard.core.health.health.reasons if reason.startswith("clock")]
-
-
-# --- health ------------------------------------------------------------------------------------------------
-
-
-def facts(**changed: Any) -> Facts:
-    good: dict[str, Any] = {
-        "status": Status.OK, "own_sigma_m": 0.1, "gps_age_s": 0.2, "imu_coverage": 1.0,
-        "silent_neighbours": (), "autopilot": "connected", "located_neighbours": 4, "directions": 3,
-    }  # fmt: skip
-    return Facts(**{**good, **changed})
-
-
-@pytest.mark.parametrize(
-    ("changed", "was", "expected"),
-    [
-        ({}, State.OK, Health(State.OK, ())),
-        ({"status": None, "waiting_for": "fixes"}, State.INIT, Health(State.INIT, ("fixes",))),
-        ({"own_sigma_m": 3.0}, State.INIT, Health(State.ALIGNING, ())),
-        ({"own_sigma_m": 3.0}, State.OK, Health(State.OK, ())),
-        ({"own_sigma_m": 6.0}, State.OK, Health(State.DEGRADED, ("position uncertain",))),
-        ({"own_sigma_m": 60.0}, State.OK, Health(State.FAULT, ("position unknown",))),
-        ({"gps_age_s": 2.0}, State.OK, Health(State.DEGRADED, ("no GPS",))),
-        ({"gps_age_s": None}, State.OK, Health(State.DEGRADED, ("no GPS",))),
-        ({"imu_coverage": 0.5}, State.OK, Health(State.DEGRADED, ("IMU incomplete",))),
-        ({"silent_neighbours": (2, 5)}, State.OK, Health(State.DEGRADED, ("not heard: 2, 5",))),
-        (
-            {"silent_neighbours": tuple(range(901, 943))},
-            State.OK,
-            Health(State.DEGRADED, ("not heard: 901, 902, 903, 904, 905, 906, 907, 908, ... and 34 more",)),
-        ),
-        ({"autopilot": "lost"}, State.OK, Health(State.DEGRADED, ("autopilot lost",))),
-        ({"status": Status.FELL_BACK}, State.OK, Health(State.DEGRADED, ("estimate fell back",))),
-        ({"status": Status.NOT_CONVERGED}, State.OK, Health(State.OK, ())),
-        ({"directions": 2, "located_neighbours": 0}, State.OK, Health(State.OK, ())),  # it has GPS
-        (
-            {"gps_age_s": 2.0, "located_neighbours": 2},
-            State.OK,
-            Health(State.DEGRADED, ("not observable: ranges to 2 of 3 located neighbours", "no GPS"), alarm=True),
-        ),
-        (
-            {"gps_age_s": 2.0, "directions": 2},
-            State.OK,
-            Health(State.DEGRADED, ("not observable: all located neighbours in one plane", "no GPS"), alarm=True),
-        ),
-        (
-            {"gps_age_s": None, "status": Status.NOT_OBSERVABLE, "ambiguous": True, "own_sigma_m": 90.0},
-            State.INIT,
-            Health(State.ALIGNING, ("not observable: the ranges leave more than one place", "no GPS"), alarm=True),
-        ),
-        ({"status": Status.NOT_OBSERVABLE}, State.OK, Health(State.DEGRADED, ("not observable",), alarm=True)),
-    ],
-)
-def test_the_state_and_its_reasons_follow_from_the_facts(
-    changed: dict[str, Any], was: State, expected: Health
-) -> None:
-    assert assess(facts(**changed), was) == expected
-
-
-def test_a_flapping_state_is_reported_once_a_second_and_the_last_word_comes_through() -> None:
-    monitor, reported = HealthMonitor(), []
-    for step in range(500):
-        now_s = 100.0 + 0.01 * step
-        flapping = step < 400 and step % 2
-        health = monitor.update(facts(gps_age_s=9.0 if flapping else 0.1), now_s)
-        if health is not None:
-            reported.append(health)
-    assert 2 <= len(reported) <= 6
-    assert monitor.changes > 300
-    assert reported[-1].state is monitor.health.state is State.OK
-
-
-def test_the_alarm_is_raised_and_cleared_as_changes_of_health() -> None:
-    monitor = HealthMonitor()
-    reported = []
-    for step in range(60):
-        blind = 20 <= step < 40
-        changed = facts(gps_age_s=9.0 if blind else 0.1, located_neighbours=2 if blind else 4)
-        health = monitor.update(changed, 100.0 + 0.1 * step)
-        if health is not None:
-            reported.append(health)
-    assert [health.alarm for health in reported] == [False, True, False]
-    assert str(reported[1]).startswith("ALARM, degraded: not observable: ranges to 2")
-    assert str(reported[2]) == "ok"
 
 
 # --- record ------------------------------------------------------------------------------------------------

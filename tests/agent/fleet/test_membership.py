@@ -15,6 +15,8 @@ from agent.fleet.record_store import RecordStore
 from agent.fleet.tracking import ABSENT_VARIANCE, FleetTracker, in_layout
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
+from estimators.integrity.finding import What, has
+from estimators.integrity.range_geometry import GeometryMonitor
 from estimators.model.layout import Layout
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import AccelerationRecord, PositionRecord, RangeRecord, Record
@@ -124,7 +126,9 @@ def test_a_drone_without_fixes_is_found_by_ranges_to_four(agent: Agent) -> None:
     assert agent.tracker.roll.own_located
     assert found[-1].status is Status.OK
     assert np.linalg.norm(found[-1].mean[:3] - AWAY[0]) < 0.5
-    assert agent.tracker.roll.anchors(1, agent.tick) == (4, 3)
+    held = agent.tracker.roll.geometry(1, agent.tick)
+    assert len(held.recent) == 4
+    assert GeometryMonitor().observe(held) == ()
 
 
 def test_two_places_are_not_chosen_between(agent: Agent) -> None:
@@ -132,7 +136,7 @@ def test_two_places_are_not_chosen_between(agent: Agent) -> None:
     anchors = (2, 3, 4)  # three at rest: the own place and its mirror image
     last = agent.run(60, heard=anchors, ranges=tuple((1, other) for other in anchors))[-1]
     assert last.status is Status.NOT_OBSERVABLE
-    assert agent.tracker.roll.ambiguous
+    assert has(agent.tracker.roll.own_location, What.AMBIGUOUS)
     assert last.covariance[0, 0] > 50.0**2
 
 

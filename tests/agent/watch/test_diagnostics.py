@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -10,13 +11,24 @@ import pytest
 from agent.config.tables import FleetConfig
 from agent.core import AgentCore
 from agent.watch.diagnostics import diagnostics_of
-from agent.watch.health import Facts, State, assess
+from agent.watch.health import assess
+from agent.watch.position_watch import PositionWatch, TickEvidence
 from estimators.factory import make_estimator
+from estimators.integrity.solution import Solution
+from estimators.integrity.staleness import Ages
 from transport.messages.report_body import Diagnostics
 from transport.security.auth import UNSIGNED
 from transport.security.sealing import Sealer
 
-SILENT = Facts(None, 1.0, None, 0.0, tuple(range(701, 1000)), "searching", waiting_for="waiting for fixes")
+SILENT = assess(
+    PositionWatch(1.0).observe(
+        TickEvidence(
+            Solution(None, 1.0, "waiting for fixes"),
+            Ages(None, 0.0, dict.fromkeys(range(701, 1000), math.inf)),
+            autopilot="searching",
+        )
+    )
+)
 NAMES = ("age_s", "clock_offset_s", "round_trip_s", "received", "lost", "heard_age_s", "restarts", "rejected")
 LINK = dict.fromkeys(NAMES, 0.1234567890123)
 
@@ -27,7 +39,7 @@ def test_the_message_of_a_drone_with_very_many_neighbours_can_be_sent(
 ) -> None:
     # GIVEN a daemon with many counters, that hears none of very many neighbours
     core = AgentCore(make_config(1), 1, make_estimator)
-    core.health.health = assess(SILENT, State.INIT)
+    core.health.health = SILENT
     counters = {f"something counted, number {i}": 123_456 for i in range(60)}
     neighbours = {str(701 + i): gauges for i in range(count)}
     # WHEN it says how it is
@@ -42,6 +54,6 @@ def test_the_message_of_a_drone_with_very_many_neighbours_can_be_sent(
 
 def test_a_reason_that_is_too_long_is_cut(make_config: Callable[..., FleetConfig]) -> None:
     core = AgentCore(make_config(1), 1, make_estimator)
-    core.health.health = replace(assess(SILENT, State.INIT), reasons=("x" * 500,))
+    core.health.health = replace(SILENT, reasons=("x" * 500,))
     message = diagnostics_of(1, core, {}, {}, {})
     assert message == Diagnostics(1, "init", ("x" * 128,))

@@ -6,8 +6,9 @@ from pathlib import Path
 
 import pytest
 
-from agent.watch.health import State
+from agent.watch.health import Health, State
 from agent.watch.health_query import STALE_AFTER_S
+from agent.watch.observers import DaemonState
 from fleetloc import cli
 
 
@@ -41,5 +42,16 @@ def test_nobody_there_is_refused_in_one_line(tmp_path: Path, capsys: pytest.Capt
     assert "no answer: No such file or directory" in error
 
 
-def test_the_states_have_the_names_that_the_command_looks_for() -> None:
-    assert {"ok", "fault"} <= {str(state) for state in State}
+@pytest.mark.parametrize(
+    ("state", "code", "strict_code"),
+    [(State.INIT, 0, 1), (State.ALIGNING, 0, 1), (State.OK, 0, 0), (State.DEGRADED, 0, 1), (State.FAULT, 1, 1)],
+)
+def test_every_state_that_a_daemon_says_has_its_exit_code(
+    monkeypatch: pytest.MonkeyPatch, state: State, code: int, strict_code: int
+) -> None:
+    # GIVEN an answer as a daemon makes it
+    answer = DaemonState(7, 12.5, Health(state, ()), {}, {}, {}).as_dict()
+    monkeypatch.setattr("agent.watch.health_query.ask", lambda _path, _timeout_s: {**answer, "age_s": 0.3})
+    # THEN only a fault fails a container, and with --require-ok whatever is not ok
+    assert cli.main(["health", "some.sock"]) == code
+    assert cli.main(["health", "some.sock", "--require-ok"]) == strict_code

@@ -1,0 +1,103 @@
+"""What a monitor finds, and the one shape that all monitors have.
+
+A monitor looks at the evidence of a tick, plain values, and returns what it finds: of what kind, about whom, how
+grave, and the figure that it follows from. No finding means that nothing is wrong. Whoever shows findings to people
+makes the words.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from enum import Enum, IntEnum, auto
+from typing import Protocol, TypeVar
+
+
+class What(Enum):
+    """What may be wrong with a position, in the order in which it is told."""
+
+    CLOCK = auto()
+    """The clock is outside the fleet's time: nothing can be sent."""
+    NO_ESTIMATE = auto()
+    NOT_ALIGNED = auto()
+    """The estimate has never been sure enough since its start."""
+    FELL_BACK = auto()
+    """The solver failed; the value is a prediction."""
+    NO_DATA = auto()
+    """Nothing was measured or received; the value is a prediction."""
+    UNKNOWN = auto()
+    """The covariance says that the position is of no use."""
+    UNCERTAIN = auto()
+    """The covariance says that the position is poor."""
+    AMBIGUOUS = auto()
+    """The ranges leave more than one place."""
+    TOO_FEW_RANGED = auto()
+    """Ranges to too few located drones."""
+    ONE_PLANE = auto()
+    """The located drones that are ranged to lie in one plane with the drone: its mirror image fits as well."""
+    MIRRORED = auto()
+    """The whole fleet may be its own mirror image."""
+    NOT_OBSERVABLE = auto()
+    """What was measured does not say where the drone is."""
+    CONTRADICTORY = auto()
+    """No place explains the measurements."""
+    AUTOPILOT = auto()
+    """The link to the autopilot is not there."""
+    IMU_GAP = auto()
+    """The IMU was silent for a part of the tick."""
+    NO_FIX = auto()
+    """No position fix of late."""
+    SILENT = auto()
+    """A drone that should be heard is not."""
+    LATENCY = auto()
+    """When the fixes were taken is known less well than where: their error is that of the latency."""
+    FIX_REFUSED = auto()
+    """A fix is where the drone cannot have been."""
+
+
+class Gravity(IntEnum):
+    """What follows from a finding for the use of the own position."""
+
+    NOTED = 0
+    """Nothing; it is kept for whoever looks for causes."""
+    DEGRADED = 1
+    """Usable; something that should be there is not."""
+    ALARM = 2
+    """The position may be wrong without its covariance saying so."""
+    NOT_YET = 3
+    """Not sure enough yet to be used."""
+    UNUSABLE = 4
+    ABSENT = 5
+    """There is no position."""
+
+
+@dataclass(frozen=True, slots=True)
+class Finding:
+    """One thing that a monitor found; monitors that can say more about what follows return a subclass."""
+
+    what: What
+    gravity: Gravity
+    about: int | None = None
+    """Whose position or data: a slot inside an estimator, an id elsewhere; ``None``: the own one."""
+    value: float | None = None
+    """The figure that it follows from, in the unit of its limit; ``None`` where there is none."""
+    limit: float | None = None
+    """What the figure was held against (`estimators.integrity.thresholds`)."""
+    detail: str = ""
+    """In a word or two what no figure says, as the state of a link."""
+
+
+EvidenceT_contra = TypeVar("EvidenceT_contra", contravariant=True)
+
+
+class Monitor(Protocol[EvidenceT_contra]):
+    """Looks at the evidence of a tick; what it remembers from tick to tick is its own."""
+
+    def observe(self, evidence: EvidenceT_contra) -> tuple[Finding, ...]:
+        """What is wrong; empty if nothing is."""
+        ...
+
+
+def has(findings: Iterable[Finding], what: What) -> bool:
+    """Whether something was found."""
+    return any(finding.what is what for finding in findings)

@@ -1,0 +1,85 @@
+"""All limits of the monitors in one place, each with its reason.
+
+Lengths in m, times in s or ticks of the fleet, sigmas are 1-sigma, nats are differences of log likelihoods.
+"""
+
+# --- what was measured last ---------------------------------------------------------------------------------
+
+GPS_LOST_S = 1.5
+"""Without a fix for so long a drone has to do without GPS: receivers give one a second or more, and may be late."""
+MIN_IMU_COVERAGE = 0.9
+"""Share of a tick that IMU samples vouch for; of the rest, a tick of 0.1 s at the usual rates loses one sample."""
+FIX_MEMORY_TICKS = 30
+"""Fixes older than this say nothing about where a drone begins: its velocity is a slope over their time."""
+RANGE_MEMORY_TICKS = 5
+"""Without a range younger than this there is nothing to hold a drone at the place where ranges found it."""
+RANGED_TICKS = 10
+"""A range older than this holds a drone no longer, nor does one to a drone that has been silent for longer. Not every
+module ranges to all neighbours in every tick, so ranges count together over this time."""
+BLIND_TICKS = 10
+"""Ticks without a position fix after which an estimator takes a drone that had some to be without."""
+
+# --- the estimate's own covariance --------------------------------------------------------------------------
+
+ALIGNED_SIGMA_M = 2.0
+"""A start is over when the own position is known so well: a good fix of its own would not tell more."""
+DEGRADED_SIGMA_M = 5.0
+"""Worse than what a receiver alone gives: the fleet does not help any more."""
+FAULT_SIGMA_M = 50.0
+"""Not to be used for anything."""
+
+# --- where ranges hold a drone ------------------------------------------------------------------------------
+
+DIRECTIONS = 3
+"""Neighbours, and directions to them, that hold a drone without GPS."""
+HELD_SPREAD = 0.03
+"""Smallest share of the squares of unit vectors along an axis for ranges to hold it: about 10 degrees off a plane.
+Closer to it an error of the ranges moves the drone by more than six times its size."""
+FLAT_SPREAD = 0.01
+"""The same for ranges that a hypothesis has already used: about 6 degrees. Its expected error has been found large
+then, and this only says whether the ranges are to blame; near a plane they are."""
+HELD_SIGMA_M = 1.5
+"""A drone less well known is not held by ranges: they would be linearised where it is not. A place found by ranges
+is none beyond it either."""
+TOLD_SIGMA_M = 3.0
+"""A neighbour's pair locates a drone that it knows at least this well."""
+LOCATED_FRACTION = 0.15
+"""A neighbour is located where the sigma of its position is below this fraction of the range to it."""
+
+# --- what the data say --------------------------------------------------------------------------------------
+
+OBSERVABLE_SIGMA_M = 10.0
+"""Position sigma of an agent, along its worst direction, up to which the data say where it is: a tenth of what stands
+for knowing nothing."""
+
+# --- other places that fit as well --------------------------------------------------------------------------
+
+FLOOR_M = 0.15
+"""Expected errors below this are not worth an alarm."""
+UNDERSTATED = 4.0
+"""Expected square error against the estimate's own variance from which on the estimate is not to be trusted: its
+sigma is half of what it should be."""
+OVERSTATED = 1.5
+"""Expected square error against the estimate's own variance from which on it replaces it."""
+WEAK_M = 0.3
+"""Expected error from which on ranges that do not determine a position leave it not observable."""
+SETTLED_TICKS = 40
+"""Ticks that such an error has to stay small before one or two neighbours in motion are taken to have done so."""
+CERTAIN = 0.999
+"""Weight of a hypothesis that is the only one."""
+DISAGREEMENT_SQUARE = 25.0
+"""Squared Mahalanobis distance in position from which on the estimate is at another place: five sigma."""
+DECISIVE_NATS = 12.0
+"""Difference of the log likelihoods of two places that decides between them: odds of 160 000."""
+SURE_NATS = 9.0
+"""Evidence from which on the mirror image, with a probability of 1e-4, is left out of the covariance."""
+CERTAIN_NATS = 24.0
+"""Evidence for the estimate that settles the matter until the fleet comes near a plane again."""
+FEWEST_MIRRORED = 4
+"""Fewer drones are in one plane, and are their own mirror image."""
+
+# --- latency ------------------------------------------------------------------------------------------------
+
+LATENCY_SHARE = 1.0
+"""Error along the track by the latency's sigma, against the sigma of the fix itself, from which on it is what limits
+the fix."""

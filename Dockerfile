@@ -20,6 +20,9 @@ COPY transport transport
 COPY agent agent
 COPY sim_bridge sim_bridge
 COPY fleetloc fleetloc
+# the wheel holds the examples and the unit: fleetloc/data links to them
+COPY configs configs
+COPY deploy deploy
 RUN pip install --no-deps . && pip uninstall --yes pip
 # Kernels for any processor of this architecture, so that no start compiles, wherever the image runs.
 ENV FLEETLOC_CACHE=/opt/fleetloc/kernels FLEETLOC_CPU=generic

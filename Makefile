@@ -54,7 +54,7 @@ lock:
 	$(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip install $(PIP_OPTIONS) '.[dev,$(EXTRAS)]'
 	{ echo "# Every package of a working environment, pinned; made by make lock."; \
-	  build/lock/bin/python -m pip freeze --exclude fleetloc; } > build/requirements.lock
+	  build/lock/bin/python -m pip freeze --all --exclude fleetloc --exclude pip; } > build/requirements.lock
 	mv build/requirements.lock requirements.lock
 	rm -rf build/lock
 

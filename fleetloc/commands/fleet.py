@@ -8,12 +8,15 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetloc.errors import INTERRUPTED
-from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides, Profiles
+from fleetloc.errors import INTERRUPTED, InputError
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles
 
 if TYPE_CHECKING:
     from agent.config.tables import FleetConfig
     from fleetloc.run.fleet_run import Outcome
+
+
+DEMO_FOLDER = "fleetloc-demo"
 
 
 def register(app: typer.Typer) -> None:
@@ -22,12 +25,17 @@ def register(app: typer.Typer) -> None:
 
 
 def fleet(
-    config: FleetFile,
+    config: Annotated[Path | None, typer.Argument(help="Configuration of the fleet (TOML), or none: --demo.")] = None,
+    demo: Annotated[
+        bool, typer.Option("--demo", help="Fly the example of three drones that comes with fleetloc.")
+    ] = False,
     duration_s: Annotated[float | None, typer.Option("--duration", help="Seconds; default: sim.duration_s.")] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the world and of injected faults.")] = None,
     loss: Loss = None,
     delay_s: Delay = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>, or fleetloc-demo.")
+    ] = None,
     json_file: FiguresFile = None,
     profiles: Profiles = None,
     overrides: Overrides = None,
@@ -43,6 +51,9 @@ def fleet(
     from fleetloc.run import run_files
     from fleetloc.warmup import announce, warm_up_everything
 
+    if demo:
+        out = out or Path(DEMO_FOLDER)
+    config = _chosen(config, demo)
     options: dict[str, float | int | None] = {
         "sim.duration_s": duration_s,
         "sim.seed": seed,
@@ -67,6 +78,17 @@ def fleet(
             raise typer.Exit(INTERRUPTED)
     write_report(fleet_config, folder, outcome, json_file, "lockstep" if lockstep else "live")
     typer.echo(f"report: {folder / run_files.REPORT_HTML}")
+
+
+def _chosen(config: Path | None, demo: bool) -> Path:
+    """The configuration to fly; raises `InputError` unless there is exactly one."""
+    from fleetloc import examples
+
+    if demo and config is not None:
+        raise InputError("--demo", "", "no configuration beside it", str(config))
+    if not demo and config is None:
+        raise InputError("CONFIG", "", "a configuration of a fleet (TOML), or --demo", "neither")
+    return config or examples.DEMO
 
 
 def _prepared(

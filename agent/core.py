@@ -30,8 +30,7 @@ from agent.fleet.records import acceleration_record, gps_records, range_record
 from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
 from agent.fleet.tracking import FleetTracker, in_layout
-from agent.outputs import EstimateReady, HealthChanged, Output, Send, estimate_message
-from agent.sensing.frames import gravity_mps2
+from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tell, estimate_message
 from agent.sensing.latency import GpsLatency
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.sensing.timeline import TickInput, Timeline, tick_of
@@ -65,13 +64,15 @@ class AgentCore:
     anything that comes in from outside.
     """
 
-    def __init__(self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory) -> None:
+    def __init__(
+        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, timeline: Timeline
+    ) -> None:
         self._config = config
         self._agent_id = agent_id
         self._period_s = config.fleet.period_s
         self.layout = Layout(config.ids)
         """Of all who may come: that of the estimates handed out."""
-        self.timeline = Timeline(self._period_s, gravity_mps2(config), config.sensors)
+        self.timeline = timeline
         self.gps_latency = GpsLatency(self._period_s, config.sensors)
         self.records = RecordStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
@@ -79,10 +80,8 @@ class AgentCore:
         self.health = HealthMonitor()
         self.counters: Counter[str] = Counter()
         self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters)
-        self.last_fault: Exception | None = None
-        """What the estimator raised last, for the log."""
-        self.autopilot_state = "searching"
-        """State of the autopilot's link, for the health; kept by the owner."""
+        self._link_state = ""
+        """Of the autopilot, for the health; told with every `advance`."""
         self._barrier: RoundBarrier[Information] = RoundBarrier(max(config.estimator.rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
@@ -190,9 +189,13 @@ class AgentCore:
             return self._close_s
         return self._packets_by_s if self._phase is _Phase.PACKETS else self._barrier.deadline_s
 
-    def advance(self, now_s: float) -> list[Output]:
-        """Do what is due; call it when `next_due_s` has come and after anything came in."""
-        outputs: list[Output] = []
+    def advance(self, now_s: float, link_state: str) -> list[CoreOutput]:
+        """Do what is due; call it when `next_due_s` has come and after anything came in.
+
+        ``link_state`` says how the autopilot's link is, for the health.
+        """
+        self._link_state = link_state
+        outputs: list[CoreOutput] = []
         if self._tick is None:
             self._enter(tick_of(now_s, self._period_s))
         if now_s > self._end_s + MAX_BEHIND_TICKS * self._period_s:
@@ -201,20 +204,21 @@ class AgentCore:
             pass
         return outputs
 
-    def _survived_step(self, now_s: float, outputs: list[Output]) -> bool:
+    def _survived_step(self, now_s: float, outputs: list[CoreOutput]) -> bool:
         """The next step of the tick if it is due. Whatever fails in it costs this tick's estimate, not the flight."""
         tick = self._tick
         try:
             return self._step(now_s, outputs)
-        except Exception as fault:  # noqa: BLE001 - counted and kept in `last_fault`, from where the daemon says it
+        except Exception as fault:  # noqa: BLE001 - counted, and handed out for the log
             try:
+                outputs.append(Faulted(fault, isinstance(fault, ESTIMATOR_FAULTS)))
                 self._finish(self._after_fault(fault), now_s, outputs)
             finally:
                 if self._tick == tick:  # never the same tick again, whatever happens
                     self._end_tick()
             return True
 
-    def _step(self, now_s: float, outputs: list[Output]) -> bool:
+    def _step(self, now_s: float, outputs: list[CoreOutput]) -> bool:
         """The next step of the tick if it is due."""
         assert self._tick is not None
         if self._phase is _Phase.END:
@@ -239,15 +243,15 @@ class AgentCore:
         self._packets_by_s = self._end_s + self._config.transport.exchange_fraction * self._period_s
         self._barrier.advance(tick)
 
-    def _close_tick(self, outputs: list[Output]) -> None:
+    def _close_tick(self, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
         self._input = self.timeline.close(self._tick)
         self.gps_latency.on_tick(self._input)
         self._on_own_record(acceleration_record(self._agent_id, self._input))
-        outputs.append(Send(self.records.packet(self._tick)))
+        outputs.append(Tell(self.records.packet(self._tick)))
         self._phase = _Phase.PACKETS
 
-    def _begin(self, now_s: float, outputs: list[Output]) -> None:
+    def _begin(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
         if not self.fleet.begin(self._tick, now_s, self.records):
             self._finish(self.fleet.nothing(self._tick), now_s, outputs)
@@ -255,24 +259,24 @@ class AgentCore:
         self._round = 0
         self._open_round_or_solve(now_s, outputs)
 
-    def _open_round_or_solve(self, now_s: float, outputs: list[Output]) -> None:
+    def _open_round_or_solve(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
         rounds = self._config.estimator.rounds
         if self._round >= rounds:
             self._finish(self.fleet.solve(), now_s, outputs)
             return
-        outputs.append(Send(self.fleet.outgoing(self._tick, self._round)))
+        outputs.append(Tell(self.fleet.outgoing(self._tick, self._round)))
         share_s = self._config.transport.rounds_fraction * self._period_s / rounds
         deadline_s = self._packets_by_s + (self._round + 1) * share_s
         self._barrier.open(self._tick, self._round, self.neighbours.informing(now_s), deadline_s)
         self._phase = _Phase.ROUND
 
-    def _mix(self, now_s: float, outputs: list[Output]) -> None:
+    def _mix(self, now_s: float, outputs: list[CoreOutput]) -> None:
         self.fleet.mix(self._round, self._barrier.close())
         self._round += 1
         self._open_round_or_solve(now_s, outputs)
 
-    def _finish(self, estimate: Estimate, now_s: float, outputs: list[Output]) -> None:
+    def _finish(self, estimate: Estimate, now_s: float, outputs: list[CoreOutput]) -> None:
         """Hand out an estimate of those who are present, and go on to the next tick."""
         assert self._tick is not None
         on_time = now_s <= self._end_s + self._period_s
@@ -281,7 +285,7 @@ class AgentCore:
         ready = EstimateReady(in_layout(estimate, present, self.layout), self._tick * self._period_s, now_s, on_time)
         message = estimate_message(estimate, present, own)
         changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)
-        outputs += (ready, Send(message))  # nothing fails from here on: no tick has two estimates
+        outputs += (ready, Tell(message))  # nothing fails from here on: no tick has two estimates
         if changed is not None:
             outputs.append(HealthChanged(changed))
         self.counters["ticks"] += 1
@@ -300,7 +304,6 @@ class AgentCore:
         """What follows from the last good estimate, flagged; the estimator starts anew from that at the next tick."""
         assert self._tick is not None
         self.counters["estimator faults" if isinstance(fault, ESTIMATOR_FAULTS) else "core faults"] += 1
-        self.last_fault = fault
         return self.fleet.fall_back(self._tick)
 
     def _leave_out_ticks(self, now_s: float) -> None:
@@ -330,7 +333,7 @@ class AgentCore:
                 imu_coverage=0.0 if self._input is None else self._input.coverage,
                 heard_age_s=self.neighbours.expected_ages_s(now_s),
             ),
-            autopilot=self.autopilot_state,
+            autopilot=self._link_state,
             geometry=roll.geometry(self._agent_id, self._tick) if alone else None,
             location=roll.own_location if alone else (),
             timing=self.gps_latency.timing,

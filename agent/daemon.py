@@ -12,12 +12,13 @@ import logging
 import signal
 import time
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 from agent.config.endpoints import parse_endpoint
 from agent.config.tables import FleetConfig
-from agent.core import ESTIMATOR_FAULTS, AgentCore, EstimatorFactory
+from agent.core import AgentCore, EstimatorFactory
 from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
 from agent.exit_codes import ExitCode
 from agent.log.run_record import RunRecord
@@ -25,8 +26,18 @@ from agent.mavlink.link import create_link
 from agent.mavlink.session import LinkState
 from agent.mavlink.signing_stamps import StampKeeper
 from agent.onboard import OnboardAgent
-from agent.outputs import EstimateReady, HealthChanged, Output, Send
-from agent.radio.radio import Radio
+from agent.outputs import (
+    ClockStepped,
+    EstimateReady,
+    Faulted,
+    HealthChanged,
+    LinkChanged,
+    NotSent,
+    Output,
+    Send,
+    ToAutopilot,
+)
+from agent.radio.radio import Listener, Radio
 from agent.radio.security import mavlink_signing, stamp_file
 from agent.warmup import warm_up
 from agent.watch.diagnostics import (
@@ -42,11 +53,6 @@ from agent.watch.observers import DaemonState, Observer
 from transport.errors import KeyFileError, SessionError, SettingsError, UnwritableError
 
 LOG = logging.getLogger("fleetloc.agent")
-MAVLINK_PERIOD_S = 0.05
-HOUSEKEEPING_PERIOD_S = 1.0
-RENEW_PERIOD_S = 10.0
-"""While the autopilot is lost, a link that is a connection is dialled anew this often: the other end may be gone."""
-FAULT_LINE_PERIOD_S = 10.0
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
     (ConfigError, ExitCode.CONFIG),
@@ -58,6 +64,17 @@ EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
     (SessionError, ExitCode.SESSION),
     (RecordError, ExitCode.RECORD),
 )
+
+
+@dataclass(frozen=True, slots=True)
+class Periods:
+    """How often the daemon does what no packet and no tick asks for, in s."""
+
+    housekeeping_s: float = 1.0
+    renew_link_s: float = 10.0
+    """While the autopilot is lost, a connection is dialled anew this often: its other end may be gone."""
+    fault_line_s: float = 10.0
+    """Between lines about faults of the estimator; every one is counted."""
 
 
 def run(
@@ -88,6 +105,15 @@ def run(
     return ExitCode.OK
 
 
+@dataclass(slots=True)
+class LinkWatch:
+    """Since when the autopilot's link is in which state, and when it is to be dialled anew."""
+
+    since_s: float
+    state: LinkState = LinkState.SEARCHING
+    renew_s: float = 0.0
+
+
 class Daemon:
     """One agent with its surroundings; made for one `run`.
 
@@ -101,22 +127,31 @@ class Daemon:
         make_estimator: EstimatorFactory,
         base: Path,
         observers: Sequence[Observer] = (),
+        periods: Periods | None = None,
     ) -> None:
         self._config = config
         self._agent_id = agent_id
+        self._periods = periods or Periods()
         self._link = create_link(parse_endpoint(config.agent(agent_id).mavlink), self._on_mavlink)
-        self.radio = Radio(config, agent_id, base, self._on_packet, self._on_uwb, self._on_gone)
+        listener = Listener(self._on_packet, self._on_uwb, self._on_gone, self._on_clock_question)
+        self.radio = Radio(config, agent_id, base, listener)
+        identity = self.radio.identity
         unix_s, host_s = time.time(), time.monotonic()
-        trust = self.radio.trust
         signing = mavlink_signing(config, agent_id, base, unix_s=unix_s)
-        self.onboard = OnboardAgent(
-            config, agent_id, make_estimator, trust, unix_s=unix_s, host_s=host_s, signing=signing
-        )
         self._record: RunRecord | None = None
         if config.record.directory is not None:
             directory = Path(config.record.directory)
-            self._record = RunRecord(config, agent_id, directory, trust, unix_s=unix_s, host_s=host_s)
-            self.onboard.journal = self._record.flight
+            self._record = RunRecord(config, agent_id, directory, identity.trust, unix_s=unix_s, host_s=host_s)
+        self.onboard = OnboardAgent(
+            config,
+            agent_id,
+            make_estimator,
+            identity,
+            unix_s=unix_s,
+            host_s=host_s,
+            link_signing=signing,
+            journal=None if self._record is None else self._record.flight,
+        )
         self._observers = tuple(observers)
         if signing is not None:
             self._observers += (StampKeeper(signing, stamp_file(config, agent_id, base)),)
@@ -127,6 +162,7 @@ class Daemon:
         self._faults = ProgramFaults(agent_id)
         self._left_out = 0
         self._next_fault_line_s = 0.0
+        self._link_watch = LinkWatch(time.monotonic())
         self._stop = asyncio.Event()
         self._failure: AgentError | None = None
 
@@ -143,25 +179,22 @@ class Daemon:
         loop.set_exception_handler(self._on_callback_error)
         for number in STOP_SIGNALS:
             loop.add_signal_handler(number, self.stop)
-        tasks: list[asyncio.Task[None]] = []
+        task: asyncio.Task[None] | None = None
         try:
             await self._link.open()
             LOG.info("agent %d: mavlink %s", self._agent_id, self._link.description)
             await self.radio.open()
             for observer in self._observers:
                 await observer.open()
-            tasks = [
-                asyncio.create_task(self._serve_mavlink(), name="mavlink"),
-                asyncio.create_task(self._keep_house(), name="housekeeping"),
-            ]
-            for task in tasks:
-                task.add_done_callback(self._on_task_done)
+            task = asyncio.create_task(self._keep_house(), name="housekeeping")
+            task.add_done_callback(self._on_task_done)
             gc.collect()
             gc.freeze()  # a full collection over all modules would cost a tick
+            self._link_watch = LinkWatch(time.monotonic())
             self._advance()
             await self._stop.wait()
         finally:
-            await self._close(tasks)
+            await self._close(task)
             for number in STOP_SIGNALS:
                 loop.remove_signal_handler(number)
         if self._failure is not None:
@@ -186,12 +219,12 @@ class Daemon:
             self._failure = AgentError(f"{task.get_name()} failed: {error!r}")
         self._stop.set()
 
-    async def _close(self, tasks: list[asyncio.Task[None]]) -> None:
+    async def _close(self, task: asyncio.Task[None] | None) -> None:
         if self._tick_timer is not None:
             self._tick_timer.cancel()
-        for task in tasks:
+        if task is not None:
             task.cancel()
-        await asyncio.gather(*tasks, return_exceptions=True)  # their failures are in `_failure` already
+            await asyncio.gather(task, return_exceptions=True)  # its failure is in `_failure` already
         with self._faults.survived("closing the radio"):  # whatever fails here, the record gets its end
             await self.radio.close()
         with self._faults.survived("closing the autopilot's link"):
@@ -218,32 +251,21 @@ class Daemon:
             return self.onboard.on_mavlink(data, time.monotonic())
         return False
 
-    async def _serve_mavlink(self) -> None:
-        """Send what is due on the autopilot's link, and say when its state changes."""
-        state = LinkState.SEARCHING
-        started_s = time.monotonic()
-        changed_s = renew_s = started_s
-        limit_s, end_after_s = self._config.mavlink.appear_timeout_s, self._config.mavlink.end_after_lost_s
-        while True:
-            host_s = time.monotonic()
-            with self._faults.survived("serving the autopilot"):
-                for frame in self.onboard.serve_autopilot(host_s):
-                    self._link.send(frame)
-            if self.onboard.autopilot.state is not state:
-                state, changed_s = self.onboard.autopilot.state, host_s
-                if state is LinkState.CONNECTED:
-                    self.radio.begin_flight(host_s)
-                LOG.info("agent %d: autopilot %s, %s", self._agent_id, state, self._link.description)
-            if state is LinkState.LOST and host_s >= renew_s:
-                renew_s = host_s + RENEW_PERIOD_S
-                self._link.renew()
-            if state is LinkState.SEARCHING and 0 < limit_s < host_s - started_s:
-                raise NoAutopilotError(self._searched_in_vain(limit_s))
-            if state is LinkState.LOST and end_after_s is not None and host_s - changed_s > end_after_s:
-                LOG.info("agent %d: autopilot lost for %g s: end, as configured", self._agent_id, end_after_s)
-                self.stop()
-                return
-            await asyncio.sleep(MAVLINK_PERIOD_S)
+    def _look_at_link(self, host_s: float) -> None:
+        """End or dial anew where the autopilot is away for long; raises `NoAutopilotError`."""
+        watch, mavlink = self._link_watch, self._config.mavlink
+        limit_s, end_after_s = mavlink.appear_timeout_s, mavlink.end_after_lost_s
+        away_s = host_s - watch.since_s
+        if watch.state is LinkState.SEARCHING and 0 < limit_s < away_s:
+            raise NoAutopilotError(self._searched_in_vain(limit_s))
+        if watch.state is not LinkState.LOST:
+            return
+        if host_s >= watch.renew_s:
+            watch.renew_s = host_s + self._periods.renew_link_s
+            self._link.renew()
+        if end_after_s is not None and away_s > end_after_s:
+            LOG.info("agent %d: autopilot lost for %g s: end, as configured", self._agent_id, end_after_s)
+            self.stop()
 
     def _searched_in_vain(self, limit_s: float) -> str:
         seen = ", ".join(self.onboard.autopilot.ignored) or "nothing"
@@ -265,17 +287,20 @@ class Daemon:
         with self._faults.survived("taking a range"):
             self.onboard.on_uwb(payload, arrived_s)
 
+    def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
+        return self.onboard.answer_clock(question, arrived_ns=arrived_ns, now_ns=time.time_ns())
+
     def _on_gone(self, agent_id: int) -> None:
         with self._faults.survived("letting a neighbour go"):
             self.onboard.on_gone(agent_id, time.monotonic())
         self._advance()
 
-    # --- the core ------------------------------------------------------------------------------------------
+    # --- the agent -----------------------------------------------------------------------------------------
 
     def _advance(self) -> None:
-        """Let the core do what is due, put out what it gives, and come back when it wants to.
+        """Let the agent do what is due, carry out what it gives, and come back when it wants to.
 
-        Raises nothing, for it is called from the midst of other things; should the core fail, the next period tries
+        Raises nothing, for it is called from the midst of other things; should the agent fail, the next period tries
         again.
         """
         if self._stop.is_set():
@@ -287,51 +312,79 @@ class Daemon:
         began_s = time.perf_counter()
         with self._faults.survived("the tick"):
             outputs = self.onboard.advance(host_s)
-            for output in outputs:
-                if isinstance(output, Send):
-                    self.radio.send(output.message)
             self._computing_s += time.perf_counter() - began_s
-            self._report(outputs)
-            due_host_s = self.onboard.next_due_host_s() or retry_host_s
+            self._carry_out(outputs)
+            due_host_s = self.onboard.next_due_host_s()
+        if due_host_s <= host_s:  # what failed is not tried again at once
+            due_host_s = retry_host_s
         self._tick_timer = asyncio.get_running_loop().call_at(due_host_s, self._advance)
 
-    def _report(self, outputs: list[Output]) -> None:
+    def _carry_out(self, outputs: Sequence[Output]) -> None:
+        """Everything that the agent wants done is done here."""
         for output in outputs:
-            if isinstance(output, EstimateReady):
-                published_s = self.onboard.fleet_s(time.monotonic())
-                self._ticks.add(self._computing_s, published_s - output.t_s - self._config.fleet.period_s)
-                tick_time_s, self._computing_s = self._computing_s, 0.0
-                if self._record is not None:  # at once: it says how many inputs the estimate had
-                    self._record.on_estimate(output, published_s, tick_time_s)
-                for observer in self._observers:
-                    self._tell(observer.on_estimate, output, published_s, tick_time_s)
-            elif isinstance(output, HealthChanged):
-                LOG.info("agent %d: %s", self._agent_id, output.health)
-        self._report_fault()
+            match output:
+                case Send():
+                    self.radio.send(output.packets)
+                case ToAutopilot():
+                    for frame in output.frames:
+                        self._link.send(frame)
+                case EstimateReady():
+                    self._on_estimate(output)
+                case HealthChanged():
+                    LOG.info("agent %d: %s", self._agent_id, output.health)
+                case LinkChanged():
+                    self._on_link_changed(output.state)
+                case Faulted():
+                    self._on_fault(output)
+                case NotSent():
+                    first = self.onboard.unsent[type(output.message).__name__] == 1
+                    LOG.log(
+                        logging.WARNING if first else logging.DEBUG,
+                        "agent %d: not sent: %s",
+                        self._agent_id,
+                        output.error,
+                    )
+                case ClockStepped():
+                    LOG.warning("agent %d: the system's clock stepped; starting anew", self._agent_id)
+
+    def _on_estimate(self, ready: EstimateReady) -> None:
+        published_s = self.onboard.fleet_s(time.monotonic())
+        self._ticks.add(self._computing_s, published_s - ready.t_s - self._config.fleet.period_s)
+        tick_time_s, self._computing_s = self._computing_s, 0.0
+        if self._record is not None:  # at once: it says how many inputs the estimate had
+            self._record.on_estimate(ready, published_s, tick_time_s)
+        for observer in self._observers:
+            self._tell(observer.on_estimate, ready, published_s, tick_time_s)
+
+    def _on_link_changed(self, state: LinkState) -> None:
+        host_s = time.monotonic()
+        self._link_watch = LinkWatch(host_s, state, renew_s=host_s)
+        if state is LinkState.CONNECTED:
+            self.radio.begin_flight(host_s)
+        LOG.info("agent %d: autopilot %s, %s", self._agent_id, state, self._link.description)
+
+    def _on_fault(self, fault: Faulted) -> None:
+        """Say what failed, of the estimator's faults one once in a while."""
+        host_s = time.monotonic()
+        if not fault.of_estimator:
+            self._faults.note("a step of the tick failed; its estimate is made of the last one", fault.error)
+        elif host_s >= self._next_fault_line_s:
+            self._next_fault_line_s = host_s + self._periods.fault_line_s
+            LOG.error("agent %d: estimator fault, starting it anew: %r", self._agent_id, fault.error)
 
     def _tell(self, listener: Callable[..., None], *what: object) -> None:
         """Each in a callback of its own: one that fails is reported by the loop and stops no other."""
         asyncio.get_running_loop().call_soon(listener, *what)
 
-    def _report_fault(self) -> None:
-        """Say what the estimator raised, once in a while; every fault is counted."""
-        fault, self.core.last_fault = self.core.last_fault, None
-        host_s = time.monotonic()
-        if fault is not None and not isinstance(fault, ESTIMATOR_FAULTS):
-            self._faults.note("a step of the tick failed; its estimate is made of the last one", fault)
-        elif fault is not None and host_s >= self._next_fault_line_s:
-            self._next_fault_line_s = host_s + FAULT_LINE_PERIOD_S
-            LOG.error("agent %d: estimator fault, starting it anew: %r", self._agent_id, fault)
-
     # --- once a second -------------------------------------------------------------------------------------
 
     async def _keep_house(self) -> None:
         while True:
-            await asyncio.sleep(HOUSEKEEPING_PERIOD_S)
+            await asyncio.sleep(self._periods.housekeeping_s)
+            self._look_at_link(time.monotonic())
             with self._faults.survived("keeping house"):
-                if self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()):
-                    LOG.warning("agent %d: the system's clock stepped; starting anew", self._agent_id)
-                    self._advance()
+                self._carry_out(self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()))
+                self._advance()
             with self._faults.survived("telling the state"):
                 self._tell_state()
             with self._faults.survived("asking for clocks"):
@@ -343,19 +396,21 @@ class Daemon:
             self._tell(observer.on_second, state)
         if self._record is not None:
             self._record.on_second(state)
-        message = diagnostics_of(self._agent_id, self.core, state.counters, state.gauges, state.neighbours)
+        message = diagnostics_of(self._agent_id, state.health, state.counters, state.gauges, state.neighbours)
         self._left_out += len(state.neighbours) - len(message.neighbours)
-        self.radio.send(message)
+        self._carry_out(self.onboard.tell(message, time.monotonic()))
 
     def state(self) -> DaemonState:
         """How the daemon is at this moment."""
         onboard, host_s = self.onboard, time.monotonic()
         now_s = onboard.fleet_s(host_s)
-        counters = counters_of(self.core, onboard.autopilot, self._link, onboard.uwb, onboard.opener)
-        counters |= self.radio.counters() | {"program faults": self._faults.count}
+        counters = counters_of(onboard) | self._link.counters()
+        radio = self.radio.counters()
+        counters["packets unsent"] += radio.pop("packets unsent")
+        counters |= radio | {"program faults": self._faults.count}
         counters["diagnostics left out"] = self._left_out
         if self._record is not None:
             counters |= self._record.counters()
-        gauges = gauges_of(self.core, onboard.autopilot, now_s) | self._ticks.gauges() | self._use.gauges()
-        neighbours = neighbour_gauges(onboard.opener, self.core, host_s, now_s)
+        gauges = gauges_of(onboard, now_s) | self._ticks.gauges() | self._use.gauges()
+        neighbours = neighbour_gauges(onboard, host_s, now_s)
         return DaemonState(self._agent_id, now_s, self.core.health.health, counters, gauges, neighbours)

@@ -1,28 +1,46 @@
-"""One drone's agent with everything around it but sockets and clocks: what the daemon drives, and the replay.
+"""One drone, sans-I/O: whatever reaches it goes in with its instant, whatever it wants done comes out as a value.
 
-Whatever comes in passes one of the methods here with its instant, and is noted in a journal if there is one.
-Nothing else has an effect, so the same calls give the same estimates, bit by bit. Instants are ``host_s``, the
-monotonic clock; fleet time follows from it and the fleet clock.
+The daemon, the fleets in virtual time, the replays, the studies and the tests drive this very class. It owns the
+MAVLink session, the timeline, the UWB intake, the mailbox (opening, sealing) and the core with its estimator::
+
+    autopilot --bytes--> on_mavlink ----.                          .--> ToAutopilot   frames for its link
+    UWB module --frame--> on_uwb -------+--> advance, when due ----+--> Send          packets for the neighbours
+    neighbours --packet--> on_packet ---'   (`next_due_host_s`)    +--> EstimateReady, HealthChanged, ...
+
+What comes in is noted in a journal if there is one. Nothing else has an effect, so the same calls give the same
+estimates, bit by bit. Instants are ``host_s``, the monotonic clock; fleet time follows from it and the fleet clock.
 """
 
 from __future__ import annotations
+
+import math
+from collections import Counter
 
 from agent.config.endpoints import LinkKind, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.inputs import Due, Gone, HouseKept, Input, Journal, MavlinkIn, PacketIn, Served, UwbIn
 from agent.mavlink.codec import mavlink
-from agent.mavlink.session import AutopilotSession
+from agent.mavlink.session import AutopilotSession, LinkState
 from agent.mavlink.signing import LinkSigning
-from agent.outputs import Output
+from agent.outputs import ClockStepped, CoreOutput, LinkChanged, NotSent, Output, Send, Tell, ToAutopilot
 from agent.sensing.clock import FleetClock, clock_fault
+from agent.sensing.frames import gravity_mps2
+from agent.sensing.samples import Sample
+from agent.sensing.timeline import Timeline
 from agent.uwb.adapter import UwbAdapter
 from agent.watch.health import State
 from agent.watch.position_watch import clock_finding
-from transport.messages.clock_body import ClockAnswer
-from transport.security.auth import Trust
+from transport.errors import EncodeError, Rejected
+from transport.messages.clock_body import ClockAnswer, decode_clock_question
+from transport.messages.information_body import Information
+from transport.messages.uwb_body import UwbFrame
+from transport.security.auth import Identity
 from transport.security.opening import Opener
+from transport.security.sealing import Message, Sealer
 
+SERVICE_PERIOD_S = 0.05
+"""How often the autopilot's link is looked after: heartbeats, TIMESYNC, rates, answers."""
 SYSTEM_STATUS = {
     State.INIT: mavlink.MAV_STATE_BOOT,
     State.ALIGNING: mavlink.MAV_STATE_STANDBY,
@@ -33,9 +51,10 @@ SYSTEM_STATUS = {
 
 
 class OnboardAgent:
-    """The core with its MAVLink session, UWB input, opener of packets and fleet clock; sans-I/O.
+    """One drone's agent.
 
-    ``core`` and the other parts are there to be looked at; a step of the system's clock brings a new core.
+    The parts (``core``, ``autopilot``, ``opener``, ...) are there to be looked at; a step of the system's clock
+    brings a new core. ``unsent`` counts messages that could not be encoded, by their type.
     """
 
     def __init__(
@@ -43,27 +62,41 @@ class OnboardAgent:
         config: FleetConfig,
         agent_id: int,
         make_estimator: EstimatorFactory,
-        trust: Trust,
+        identity: Identity,
         *,
         unix_s: float,
         host_s: float,
-        signing: LinkSigning | None = None,
+        link_signing: LinkSigning | None = None,
+        journal: Journal | None = None,
+        linked: bool = True,
     ) -> None:
-        """``unix_s`` and ``host_s`` are one instant on the two clocks; ``signing`` is of the autopilot's link."""
+        """``unix_s`` and ``host_s`` are one instant on the two clocks; ``link_signing`` is of the autopilot's link.
+
+        ``linked``: whether there is such a link; without one samples come ready made (`on_sample`), as from a log.
+        """
+        self.agent_id = agent_id
         self._config = config
-        self._agent_id = agent_id
         self._make_estimator = make_estimator
+        self._journal = journal
+        self._linked = linked
         self.clock = FleetClock(config.fleet.epoch_unix_s, unix_s=unix_s, host_s=host_s)
         self.core = self._new_core()
         kind = parse_endpoint(config.agent(agent_id).mavlink).kind
-        self.autopilot = AutopilotSession(
-            config, agent_id, datagrams=kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT), signing=signing
-        )
+        datagrams = kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
+        self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
         self.uwb = UwbAdapter(agent_id, config.ids, config.sensors)
         freshness_s = config.security.freshness_s
-        self.opener = Opener(config.fleet.name, config.ids, trust, own_id=agent_id, freshness_s=freshness_s)
-        self.journal: Journal | None = None
-        """Told of every input."""
+        self.opener = Opener(
+            config.fleet.name, config.ids, identity.trust, own_id=agent_id, freshness_s=freshness_s
+        )
+        self.sealer = Sealer(config.fleet.name, agent_id, boot=identity.boot, signing=identity.signing)
+        self._double = {"auto": None, "float32": False, "float64": True}[config.transport.information_format]
+        self.unsent: Counter[str] = Counter()
+        self._told_state = LinkState.SEARCHING
+        self._serve_s = -math.inf if linked else math.inf
+        """When the autopilot's link is to be served next, host time."""
+        self._something_came = True
+        """Whether the core has anything new since it last did what was due."""
         self._look_at_clock(host_s)
 
     def fleet_s(self, host_s: float) -> float:
@@ -74,17 +107,23 @@ class OnboardAgent:
         """UTC of a host time, as the fleet clock has it: without the jitter of the system's."""
         return self.fleet_s(host_s) + self._config.fleet.epoch_unix_s
 
-    def next_due_host_s(self) -> float | None:
-        """When `advance` has something to do even if nothing comes in; ``None`` before its first call."""
+    def next_due_host_s(self) -> float:
+        """When `advance` has something to do even if nothing comes in; minus infinity at the start."""
         due_s = self.core.next_due_s()
-        return None if due_s is None else due_s - self.clock.offset_s
+        if due_s is None or self._something_came:
+            return -math.inf
+        return min(due_s - self.clock.offset_s, self._serve_s)
+
+    @property
+    def link_state(self) -> LinkState:
+        """How the autopilot's link is; without one, samples are connected by definition."""
+        return self.autopilot.state if self._linked else LinkState.CONNECTED
 
     # --- what comes in --------------------------------------------------------------------------------------
 
     def on_mavlink(self, data: bytes, host_s: float) -> bool:
         """Bytes of the autopilot's link; whether its system sent them (a stranger's must not draw our answers)."""
         session = self.autopilot
-        session.fleet_offset_s = self.clock.offset_s
         before = session.heard
         samples = session.receive(data, host_s)
         frames = session.decoder.frames
@@ -96,27 +135,9 @@ class OnboardAgent:
             self.core.on_sample(sample, now_s)
         return session.heard > before
 
-    def serve_autopilot(self, host_s: float) -> list[bytes]:
-        """The frames to send to the autopilot now."""
-        self._note(Served(host_s), host_s)
-        self.autopilot.fleet_offset_s = self.clock.offset_s
-        self.autopilot.system_status = SYSTEM_STATUS[self.core.health.health.state]
-        frames = self.autopilot.to_send(host_s)
-        self.core.autopilot_state = str(self.autopilot.state)
-        if frames and self.journal is not None:
-            self.journal.note_sent(frames, self.unix_s(host_s))
-        return frames
-
-    def on_packet(self, key: str, data: bytes, *, arrived_s: float, host_s: float, unix_ns: int) -> None:
-        """A packet under a key expression: opened, and given to the core or the neighbour's clock filter."""
-        self._note(PacketIn(host_s, unix_ns, arrived_s, key, data), host_s)
-        received = self.opener.open(key, data, now=host_s, unix_ns=unix_ns)
-        if received is None:
-            return
-        if isinstance(received.message, ClockAnswer):
-            self.opener.peers[received.sender].clock.add(received.message, unix_ns)
-        else:
-            self.core.on_packet(received, self.fleet_s(host_s))
+    def on_sample(self, sample: Sample, host_s: float) -> None:
+        """A sample that was made elsewhere, of a log or a study; no journal takes it down."""
+        self.core.on_sample(sample, self.fleet_s(host_s))
 
     def on_uwb(self, data: bytes, host_s: float) -> None:
         """A frame of the own UWB module that arrived at ``host_s``."""
@@ -125,25 +146,68 @@ class OnboardAgent:
         for sample in self.uwb.receive(data, now_s=now_s, host_s=host_s, unix_s=self.unix_s(host_s)):
             self.core.on_range(sample, now_s)
 
+    def on_uwb_frame(self, frame: UwbFrame, age_s: float, host_s: float) -> None:
+        """A frame that was decoded elsewhere, measured ``age_s`` before ``host_s``; no journal takes it down."""
+        now_s = self.fleet_s(host_s)
+        for sample in self.uwb.samples_of(frame, age_s, now_s):
+            self.core.on_range(sample, now_s)
+
+    def on_packet(self, key: str, data: bytes, *, arrived_s: float, host_s: float, unix_ns: int) -> None:
+        """A packet under a key expression: opened, and given to the core or the neighbour's clock filter."""
+        self._note(PacketIn(host_s, unix_ns, arrived_s, key, data), host_s)
+        self._something_came = True
+        received = self.opener.open(key, data, now=host_s, unix_ns=unix_ns)
+        if received is None:
+            return
+        if isinstance(received.message, ClockAnswer):
+            self.opener.peers[received.sender].clock.add(received.message, unix_ns)
+        else:
+            self.core.on_packet(received, self.fleet_s(host_s))
+
     def on_gone(self, agent_id: int, host_s: float) -> None:
         """A neighbour has left."""
         self._note(Gone(host_s, agent_id), host_s)
+        self._something_came = True
         self.core.on_gone(agent_id)
 
-    def advance(self, host_s: float) -> list[Output]:
-        """Let the core do what is due."""
-        self._note(Due(host_s), host_s)
-        return self.core.advance(self.fleet_s(host_s))
+    # --- what is done ---------------------------------------------------------------------------------------
 
-    def keep_house(self, *, unix_s: float, host_s: float) -> bool:
-        """What is to be done once a second; true if the system's clock stepped: then the core is a new one."""
+    def advance(self, host_s: float) -> list[Output]:
+        """Do what is due: serve the autopilot's link, work on the tick."""
+        outputs: list[Output] = []
+        if host_s >= self._serve_s:
+            self._serve_s = host_s + SERVICE_PERIOD_S
+            outputs += self._serve(host_s)
+        due_s = self.core.next_due_s()
+        if due_s is None or self._something_came or self.fleet_s(host_s) >= due_s:
+            self._something_came = False
+            outputs += self._work(host_s)
+        return outputs
+
+    def keep_house(self, *, unix_s: float, host_s: float) -> list[Output]:
+        """What is to be done once a second: compare the clocks, give up what is incomplete for too long."""
         self._note(HouseKept(host_s, unix_s), host_s)
         self.opener.expire(host_s)
         stepped = self.clock.sync(unix_s=unix_s, host_s=host_s)
         if stepped:
             self.core = self._new_core()
         self._look_at_clock(host_s)
-        return stepped
+        return [ClockStepped()] if stepped else []
+
+    def tell(self, message: Message, host_s: float) -> list[Output]:
+        """Send a message of the shell's own, such as what the daemon says of itself."""
+        return self._sealed(message, self._unix_ns(host_s))
+
+    def answer_clock(self, question: bytes, *, arrived_ns: int, now_ns: int) -> bytes | None:
+        """The packet that answers a neighbour's question for our UTC; ``None`` for a question that is none."""
+        try:
+            asked_ns = decode_clock_question(question)
+        except Rejected:
+            self.unsent["clock question malformed"] += 1
+            return None
+        # Our UTC clock may be set back while we answer; an answer may not come before its question.
+        answer = ClockAnswer(asked_ns, arrived_ns, max(now_ns, arrived_ns))
+        return self.sealer.seal(answer, t_ns=now_ns)[0].data
 
     def take(self, event: Input) -> list[Output]:
         """What a recorded input brings about."""
@@ -151,7 +215,7 @@ class OnboardAgent:
             case MavlinkIn():
                 self.on_mavlink(event.data, event.host_s)
             case Served():
-                self.serve_autopilot(event.host_s)
+                return self._serve(event.host_s)
             case PacketIn():
                 self.on_packet(
                     event.key, event.data, arrived_s=event.arrived_s, host_s=event.host_s, unix_ns=event.unix_ns
@@ -161,16 +225,53 @@ class OnboardAgent:
             case Gone():
                 self.on_gone(event.agent, event.host_s)
             case HouseKept():
-                self.keep_house(unix_s=event.unix_s, host_s=event.host_s)
+                return self.keep_house(unix_s=event.unix_s, host_s=event.host_s)
             case Due():
-                return self.advance(event.host_s)
+                return self._work(event.host_s)
         return []
 
     # --- common ---------------------------------------------------------------------------------------------
 
+    def _serve(self, host_s: float) -> list[Output]:
+        """What is due on the autopilot's link."""
+        self._note(Served(host_s), host_s)
+        frames = self.autopilot.to_send(host_s, SYSTEM_STATUS[self.core.health.health.state])
+        outputs: list[Output] = []
+        if frames:
+            outputs.append(ToAutopilot(tuple(frames)))
+            if self._journal is not None:
+                self._journal.note_sent(frames, self.unix_s(host_s))
+        if self.autopilot.state is not self._told_state:
+            self._told_state = self.autopilot.state
+            outputs.append(LinkChanged(self._told_state))
+        return outputs
+
+    def _work(self, host_s: float) -> list[Output]:
+        """What is due in the core; its messages are sealed."""
+        self._note(Due(host_s), host_s)
+        outputs: list[Output] = []
+        for output in self.core.advance(self.fleet_s(host_s), str(self.link_state)):
+            outputs += self._put_out(output, host_s)
+        return outputs
+
+    def _put_out(self, output: CoreOutput, host_s: float) -> list[Output]:
+        return self._sealed(output.message, self._unix_ns(host_s)) if isinstance(output, Tell) else [output]
+
+    def _sealed(self, message: Message, t_ns: int) -> list[Output]:
+        """A message in packets; one that does not fit into any is counted."""
+        double = self._double if isinstance(message, Information) else None
+        try:
+            return [Send(tuple(self.sealer.seal(message, t_ns=t_ns, double=double)), message)]
+        except EncodeError as error:
+            self.unsent[type(message).__name__] += 1
+            return [NotSent(message, error)]
+
+    def _unix_ns(self, host_s: float) -> int:
+        return round(self.unix_s(host_s) * 1e9)
+
     def _note(self, event: Input, host_s: float) -> None:
-        if self.journal is not None:
-            self.journal.note(event, self.unix_s(host_s))
+        if self._journal is not None:
+            self._journal.note(event, self.unix_s(host_s))
 
     def _look_at_clock(self, host_s: float) -> None:
         """An estimate whose tick fits no packet reaches nobody: say so in the health."""
@@ -178,4 +279,6 @@ class OnboardAgent:
         self.core.health.hold(clock_finding(fault))
 
     def _new_core(self) -> AgentCore:
-        return AgentCore(self._config, self._agent_id, self._make_estimator)
+        period_s = self._config.fleet.period_s
+        timeline = Timeline(period_s, gravity_mps2(self._config), self._config.sensors)
+        return AgentCore(self._config, self.agent_id, self._make_estimator, timeline)

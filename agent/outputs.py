@@ -1,21 +1,44 @@
-"""What the agent core hands out."""
+"""What comes out of an agent, as values; the shell around it (daemon, virtual fleet, replay) carries them out."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
+from agent.mavlink.session import LinkState
 from agent.watch.health import Health
 from estimators.estimator import Estimate
+from transport.errors import EncodeError
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate
-from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements
+from transport.security.sealing import Message, Packet
+
+
+@dataclass(frozen=True, slots=True)
+class Tell:
+    """A message of the core for the neighbours, not sealed yet; no shell sees it."""
+
+    message: Message
 
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """A message for the neighbours."""
+    """Packets for the neighbours, in this order, each on its own stream; ``message`` is what they say."""
 
-    message: Measurements | Information | FleetEstimate
+    packets: tuple[Packet, ...]
+    message: Message
+
+
+@dataclass(frozen=True, slots=True)
+class ToAutopilot:
+    """MAVLink frames for the autopilot's link."""
+
+    frames: tuple[bytes, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class LinkChanged:
+    """The autopilot appeared, was lost, or is back."""
+
+    state: LinkState
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,7 +61,29 @@ class HealthChanged:
     health: Health
 
 
-Output = Send | EstimateReady | HealthChanged
+@dataclass(frozen=True, slots=True)
+class Faulted:
+    """Something failed and was flown on with: ``of_estimator``, whose numerics broke, or a fault of the program."""
+
+    error: Exception
+    of_estimator: bool
+
+
+@dataclass(frozen=True, slots=True)
+class ClockStepped:
+    """The system's clock stepped, so the core begins anew."""
+
+
+@dataclass(frozen=True, slots=True)
+class NotSent:
+    """A message that fits into no packet, and why."""
+
+    message: Message
+    error: EncodeError
+
+
+CoreOutput = Tell | EstimateReady | HealthChanged | Faulted
+Output = Send | NotSent | ToAutopilot | LinkChanged | EstimateReady | HealthChanged | Faulted | ClockStepped
 
 
 def estimate_message(estimate: Estimate, agents: tuple[int, ...], own: slice) -> FleetEstimate:

@@ -174,6 +174,29 @@ def _docstring(init: Path) -> str | None:
     return ast.get_docstring(ast.parse(init.read_text())) if init.is_file() else None
 
 
+PARTS_OF_A_DRONE = {"AgentCore", "AutopilotSession", "Timeline"}
+"""What `agent.onboard.OnboardAgent` is put together of; nobody else does that."""
+ASSEMBLY = Path("agent") / "onboard.py"
+
+
+def assemblies(source: str) -> list[str]:
+    """The parts of a drone that a module constructs."""
+    calls = (node.func for node in ast.walk(ast.parse(source)) if isinstance(node, ast.Call))
+    names = (func.id if isinstance(func, ast.Name) else getattr(func, "attr", "") for func in calls)
+    return sorted(name for name in names if name in PARTS_OF_A_DRONE)
+
+
+def test_one_drone_is_assembled_in_one_place() -> None:
+    everything = [*modules(), *sorted((ROOT / "tests").rglob("*.py"))]
+    found = {str(path.relative_to(ROOT)): parts for path in everything if (parts := assemblies(path.read_text()))}
+    assert found == {str(ASSEMBLY): sorted(PARTS_OF_A_DRONE)}
+
+
+def test_assembly_check_finds_faults() -> None:
+    source = "core = agent.core.AgentCore(config)\nx = Timeline()\nprint(Timeline)"
+    assert assemblies(source) == ["AgentCore", "Timeline"]
+
+
 def test_sources_know_nothing_of_one_machine() -> None:
     faults = {
         str(path.relative_to(ROOT)): found

@@ -54,6 +54,10 @@ class MavlinkLink(ABC):
         doing = "listening on" if self.endpoint.kind in (LinkKind.UDP_IN, LinkKind.TCP_IN) else "sending to"
         return f"{doing} {self.endpoint}" + (f", peer {self.peer}" if self.peer else ", nobody there yet")
 
+    def counters(self) -> dict[str, int]:
+        """What this side counts."""
+        return {"mavlink tx dropped": self.dropped, "mavlink opened": self.opened}
+
     @abstractmethod
     async def open(self) -> None:
         """Open the link; raises `LinkError` if that can never work (port taken, no such device)."""

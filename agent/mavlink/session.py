@@ -1,8 +1,7 @@
 """The session with the autopilot, sans-I/O: bytes in with a time, samples and bytes out.
 
-``now_s`` is the host's monotonic clock; samples come out in fleet time, which is host time plus
-``fleet_offset_s``. TIMESYNC is answered with the same monotonic clock, so that a step of UTC cannot reach
-the autopilot's own clock filter.
+``now_s`` is the host's monotonic clock; samples come out in fleet time, by the fleet clock. TIMESYNC is answered
+with the same monotonic clock, so that a step of UTC cannot reach the autopilot's own clock filter.
 """
 
 from __future__ import annotations
@@ -17,6 +16,7 @@ from agent.mavlink.sample_adapter import SampleAdapter
 from agent.mavlink.signing import LinkSigning
 from agent.mavlink.stream_rates import StreamRates
 from agent.mavlink.timesync import BootClock
+from agent.sensing.clock import FleetClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Sample
 
@@ -59,7 +59,13 @@ class AutopilotSession:
     """
 
     def __init__(
-        self, config: FleetConfig, agent_id: int, *, datagrams: bool, signing: LinkSigning | None = None
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        clock: FleetClock,
+        *,
+        datagrams: bool,
+        signing: LinkSigning | None = None,
     ) -> None:
         table = config.agent(agent_id)
         self._settings = config.mavlink
@@ -67,6 +73,7 @@ class AutopilotSession:
         self._expected_flavour = table.autopilot
         self.signing = signing
         self._epoch_unix_s = config.fleet.epoch_unix_s
+        self._fleet_clock = clock
         self.decoder = Decoder(datagrams=datagrams, signing=signing)
         self._encoder = Encoder(self._expected_system, config.mavlink.component_id, signing)
         self.clock = BootClock(config.mavlink.max_rtt_s)
@@ -76,10 +83,6 @@ class AutopilotSession:
         self.rates = StreamRates(_wanted(config), config.mavlink.rate_floor)
         self.state = LinkState.SEARCHING
         self.autopilot: AutopilotId | None = None
-        self.fleet_offset_s = 0.0
-        """Fleet time minus host time; kept by the owner."""
-        self.system_status: int | None = mavlink.MAV_STATE_STANDBY
-        """What our heartbeat says; ``None`` = a fault: send none."""
         self.heard = 0
         """Messages of the autopilot's system, whatever its component but our own."""
         self.reboots = 0
@@ -110,14 +113,17 @@ class AutopilotSession:
                 samples.append(sample)
         return samples
 
-    def to_send(self, now_s: float) -> list[bytes]:
-        """Frames due now: answers, our heartbeat, TIMESYNC and rate requests; notes a lost autopilot."""
+    def to_send(self, now_s: float, system_status: int | None) -> list[bytes]:
+        """Frames due now: answers, our heartbeat, TIMESYNC and rate requests; notes a lost autopilot.
+
+        ``system_status`` (MAV_STATE) is what our heartbeat says; ``None`` = a fault: none is sent.
+        """
         self._tell_time(now_s)
         frames, self._answers = self._answers, []
-        if now_s >= self._next_heartbeat_s and self.system_status is not None:
+        if now_s >= self._next_heartbeat_s and system_status is not None:
             due_s = self._next_heartbeat_s or now_s
             self._next_heartbeat_s = max(due_s + HEARTBEAT_PERIOD_S, now_s)
-            frames.append(self._encoder.encode(_heartbeat(self.system_status)))
+            frames.append(self._encoder.encode(_heartbeat(system_status)))
         if self.state is LinkState.SEARCHING:
             return frames
         if self.state is LinkState.CONNECTED:
@@ -134,7 +140,7 @@ class AutopilotSession:
 
     def _tell_time(self, now_s: float) -> None:
         if self.signing is not None:
-            self.signing.unix_s = now_s + self.fleet_offset_s + self._epoch_unix_s
+            self.signing.unix_s = self._fleet_clock.fleet_s(now_s) + self._epoch_unix_s
 
     # --- incoming ------------------------------------------------------------------------------------------
 
@@ -157,7 +163,7 @@ class AutopilotSession:
         boot_ms = getattr(message, "time_boot_ms", None)
         if boot_ms is not None:
             self._on_boot_time(boot_ms * 1e-3, now_s)
-        return self.samples.convert(message, now_s + self.fleet_offset_s)
+        return self.samples.convert(message, self._fleet_clock.fleet_s(now_s))
 
     def _on_heartbeat(self, message: Message, now_s: float) -> None:
         if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type in _NOT_VEHICLES:
@@ -222,9 +228,9 @@ class AutopilotSession:
 
     def _fleet_time_of_boot(self, boot_s: float, arrival_s: float) -> float | None:
         if not self.clock.synchronised:
-            self.clock.on_arrival(boot_s, arrival_s - self.fleet_offset_s)
+            self.clock.on_arrival(boot_s, arrival_s - self._fleet_clock.offset_s)
         host_s = self.clock.host_s(boot_s)
-        return None if host_s is None else host_s + self.fleet_offset_s
+        return None if host_s is None else self._fleet_clock.fleet_s(host_s)
 
     # --- outgoing ------------------------------------------------------------------------------------------
 

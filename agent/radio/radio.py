@@ -1,6 +1,7 @@
-"""The daemon's side of the transport: seals packets, injects configured faults, watches presence.
+"""The daemon's side of the transport: puts packets on the air, injects configured faults, watches presence.
 
-Packets are handed on as they came, decrypted where the fleet encrypts; `agent.onboard` opens them.
+Packets come sealed from `agent.onboard`, and are handed on to it as they came; here they are encrypted and decrypted
+where the fleet encrypts.
 """
 
 from __future__ import annotations
@@ -8,20 +9,20 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config.tables import FleetConfig
 from agent.radio.radio_faults import channel_settings
 from agent.radio.security import agent_session, credentials, expiry_warnings, new_salt
-from transport.errors import EncodeError, Rejected, RejectionCounter
+from transport.errors import Rejected, RejectionCounter
 from transport.link.channel import Channel, ChannelSettings
 from transport.link.session import Handlers, Session, open_session
 from transport.link.streams import Stream, key_expression, parse_key
-from transport.messages.clock_body import ClockAnswer, check_echo, decode_clock_question, encode_clock_question
-from transport.messages.information_body import Information
-from transport.security.sealing import Message, Packet, Sealer
+from transport.messages.clock_body import check_echo, encode_clock_question
+from transport.security.auth import Identity
+from transport.security.sealing import Packet
 
 LOG = logging.getLogger("fleetloc.agent")
 USED_STREAMS = (Stream.MEAS, Stream.INFO)
@@ -31,12 +32,24 @@ OnPacket = Callable[[str, bytes, float, int], None]
 OnUwb = Callable[[bytes, float], None]
 """(payload, arrival on the monotonic clock in s)."""
 OnGone = Callable[[int], None]
+OnClockQuestion = Callable[[bytes, int], bytes | None]
+"""(question, UTC of its arrival in ns) -> the packet that answers it."""
+
+
+@dataclass(frozen=True, slots=True)
+class Listener:
+    """Whom the radio hands on to what comes in."""
+
+    on_packet: OnPacket
+    on_uwb: OnUwb
+    on_gone: OnGone
+    on_clock_question: OnClockQuestion
 
 
 class Radio:
     """One agent's session with its neighbours; open it once, close it once.
 
-    ``trust`` holds the neighbours' public keys.
+    ``identity`` is whom the agent goes on the air as.
     """
 
     def __init__(
@@ -44,34 +57,29 @@ class Radio:
         config: FleetConfig,
         agent_id: int,
         base: Path,
-        on_packet: OnPacket,
-        on_uwb: OnUwb,
-        on_gone: OnGone,
+        listener: Listener,
     ) -> None:
         """Read the keys and take the next start number; raises `SecurityError`, `KeyFileError`, `SettingsError`."""
         self._config = config
         self._agent_id = agent_id
         self._fleet = config.fleet.name
         self._neighbours = config.neighbours(agent_id)
-        self._on_packet, self._on_uwb, self._on_gone = on_packet, on_uwb, on_gone
+        self._listener = listener
         own = credentials(config, agent_id, base, unix_s=time.time(), salt=new_salt())
         for warning in expiry_warnings(config, agent_id, base, unix_s=time.time()):
             LOG.warning("agent %d: %s", agent_id, warning)
-        self.trust, self._envelopes, self._uwb_seal = own.trust, own.envelopes, own.uwb_seal
+        self.identity = Identity(own.signing, own.trust, own.boot)
+        self._envelopes, self._uwb_seal = own.envelopes, own.uwb_seal
         self._settings = agent_session(config, agent_id, base)
-        self._sealer = Sealer(self._fleet, agent_id, boot=own.boot, signing=own.signing)
         self._channel: Channel[tuple[str, bytes, float]] = Channel.seeded(
             self._faults(None), seed=config.transport.seed, receiver=agent_id, neighbours=self._neighbours
         )
         self._flying = False
         self._heard_s: dict[int, float] = {}
         self._redeclared = 0
-        transport = config.transport
-        self._double = {"auto": None, "float32": False, "float64": True}[transport.information_format]
         self._timer: asyncio.TimerHandle | None = None
         self._repair: asyncio.TimerHandle | None = None
         self._session: Session | None = None
-        self._unsent: Counter[str] = Counter()
         self._rejections = RejectionCounter()
         self._uwb_rejections = RejectionCounter()
 
@@ -95,40 +103,25 @@ class Radio:
         if self._session is not None:
             await self._session.close()
 
-    def send(self, message: Message) -> None:
-        """Seal a message and put it out; one that cannot be sent is counted."""
+    def send(self, packets: Iterable[Packet]) -> None:
+        """Put packets out, each on its stream; nothing while the session is not open."""
         if self._session is None:
             return
-        try:
-            double = self._double if isinstance(message, Information) else None
-            packets = self._sealed(message, time.time_ns(), double)
-        except EncodeError as error:
-            kind = type(message).__name__
-            self._unsent[kind] += 1
-            level = logging.WARNING if self._unsent[kind] == 1 else logging.DEBUG
-            LOG.log(level, "agent %d: not sent: %s", self._agent_id, error)
-            return
         for packet in packets:
-            self._session.publish(packet.stream, packet.data)
+            self._session.publish(packet.stream, self._enclosed(packet.stream, packet.data))
 
-    def _sealed(self, message: Message, t_ns: int, double: bool | None = None) -> list[Packet]:
-        packets = self._sealer.seal(message, t_ns=t_ns, double=double)
+    def _enclosed(self, stream: Stream, data: bytes) -> bytes:
+        """A packet as it crosses the link: encrypted where the fleet encrypts."""
         if self._envelopes is None:
-            return packets
-        keys = (key_expression(self._fleet, self._agent_id, packet.stream) for packet in packets)
-        return [
-            Packet(packet.stream, self._envelopes.close(key, packet.data))
-            for key, packet in zip(keys, packets, strict=True)
-        ]
+            return data
+        return self._envelopes.close(key_expression(self._fleet, self._agent_id, stream), data)
 
     def counters(self) -> dict[str, int]:
         """What this side counts."""
         session = self._session
         counts = {
-            "packets sent": self._sealer.sent,
-            "packets unsent": self._unsent.total() + (session.failed if session else 0),
+            "packets unsent": session.failed if session else 0,
             "packets shed": session.shed if session else 0,
-            "records left out": self._sealer.left_out,
             "injected losses": sum(self._channel.lost.values()),
             "subscriptions repeated": self._redeclared,
         }
@@ -150,15 +143,8 @@ class Radio:
         self._hand_on(key, packet, time.monotonic(), arrived_ns, asked_ns)
 
     def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
-        try:
-            asked_ns = decode_clock_question(question)
-        except Rejected:
-            self._unsent["clock question malformed"] += 1
-            return None
-        now_ns = time.time_ns()
-        # Our UTC clock may be set back while we answer; an answer may not come before its question.
-        answer = ClockAnswer(asked_ns, arrived_ns, max(now_ns, arrived_ns))
-        return self._sealed(answer, now_ns)[0].data
+        answer = self._listener.on_clock_question(question, arrived_ns)
+        return None if answer is None else self._enclosed(Stream.CLOCK, answer)
 
     def _on_sample(self, key: str, payload: bytes, arrived_s: float) -> None:
         parsed = parse_key(key)
@@ -182,7 +168,7 @@ class Radio:
                 self._uwb_rejections.count(rejected.reason)
                 LOG.log(logging.WARNING if first else logging.DEBUG, "agent %d: %s", self._agent_id, rejected)
                 return
-        self._on_uwb(payload, arrived_s)
+        self._listener.on_uwb(payload, arrived_s)
 
     def begin_flight(self, host_s: float) -> None:
         """The autopilot was heard: from the first such instant on count the times of injected outages."""
@@ -243,9 +229,9 @@ class Radio:
             self._rejections.count(rejected.reason)
             LOG.debug("agent %d: %s", self._agent_id, rejected)
             return
-        self._on_packet(key, payload, arrived_s, unix_ns)
+        self._listener.on_packet(key, payload, arrived_s, unix_ns)
 
     def _on_presence(self, agent_id: int, alive: bool) -> None:
         if agent_id in self._neighbours and not alive:
             LOG.info("agent %d: neighbour %d has left", self._agent_id, agent_id)
-            self._on_gone(agent_id)
+            self._listener.on_gone(agent_id)

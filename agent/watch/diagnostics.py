@@ -13,13 +13,10 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from agent.core import AgentCore
-from agent.mavlink.link import MavlinkLink
-from agent.mavlink.session import AutopilotSession
-from agent.uwb.adapter import UwbAdapter
+from agent.onboard import OnboardAgent
+from agent.watch.health import Health
 from transport.messages.header import MAX_BODY_BYTES, Kind
 from transport.messages.report_body import Diagnostics
-from transport.security.opening import Opener
 
 TICKS_REMEMBERED = 1024
 TICKS_REMEMBERED = 1024
@@ -74,22 +71,22 @@ def _rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-def counters_of(
-    core: AgentCore, session: AutopilotSession, link: MavlinkLink, uwb: UwbAdapter, opener: Opener
-) -> dict[str, int]:
-    """Everything that is counted, by name; names of the same thing share their first word."""
+def counters_of(onboard: OnboardAgent) -> dict[str, int]:
+    """Everything that the agent counts, by name; names of the same thing share their first word."""
+    core, session, uwb, opener = onboard.core, onboard.autopilot, onboard.uwb, onboard.opener
     decoder = session.decoder
     counters = {
         "mavlink rx": decoder.received,
         "mavlink tx": session.sent,
         "mavlink lost": decoder.lost,
         "mavlink bad": decoder.bad.total(),
-        "mavlink tx dropped": link.dropped,
-        "mavlink opened": link.opened,
         "mavlink reboots": session.reboots,
         "timesync rejected": session.clock.rejected,
         "uwb frames": uwb.intake.received,
         "uwb unusable": uwb.intake.skipped,
+        "packets sent": onboard.sealer.sent,
+        "packets unsent": onboard.unsent.total(),
+        "records left out": onboard.sealer.left_out,
         "packets received": sum(peer.received for _, peer in opener.peers.items()),
         "packets lost": sum(peer.lost for _, peer in opener.peers.items()),
     }
@@ -111,8 +108,9 @@ def counters_of(
     return counters
 
 
-def gauges_of(core: AgentCore, session: AutopilotSession, now_s: float) -> dict[str, float]:
-    """What is measured at this moment; what is not known is left out."""
+def gauges_of(onboard: OnboardAgent, now_s: float) -> dict[str, float]:
+    """What is measured at this moment, fleet time ``now_s``; what is not known is left out."""
+    core, session = onboard.core, onboard.autopilot
     rates = {f"rate_{mid}_hz": stream.rate_hz for mid, stream in session.rates.streams.items()}
     gauges = {
         "rtt_s": session.clock.rtt_s,
@@ -125,8 +123,9 @@ def gauges_of(core: AgentCore, session: AutopilotSession, now_s: float) -> dict[
     return {name: value for name, value in gauges.items() if value is not None and math.isfinite(value)}
 
 
-def neighbour_gauges(opener: Opener, core: AgentCore, host_s: float, now_s: float) -> dict[str, dict[str, float]]:
+def neighbour_gauges(onboard: OnboardAgent, host_s: float, now_s: float) -> dict[str, dict[str, float]]:
     """The state of each neighbour's link by id; the opener keeps host time, the core fleet time."""
+    core, opener = onboard.core, onboard.opener
     peers = {str(agent_id): peer.as_dict(host_s) for agent_id, peer in opener.peers.items()}
     for agent_id, age_s in core.neighbours.ages_s(now_s).items():
         peers[str(agent_id)]["heard_age_s"] = age_s
@@ -135,13 +134,12 @@ def neighbour_gauges(opener: Opener, core: AgentCore, host_s: float, now_s: floa
 
 def diagnostics_of(
     agent_id: int,
-    core: AgentCore,
+    health: Health,
     counters: dict[str, int],
     gauges: dict[str, float],
     neighbours: dict[str, dict[str, float]],
 ) -> Diagnostics:
     """The message that goes out; of very many neighbours the first ones, as many as fit into it."""
-    health = core.health.health
     reasons = tuple(reason[:MAX_REASON] for reason in health.reasons)
     message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges)
     return msgspec.structs.replace(message, neighbours=_fitting(neighbours, len(msgspec.json.encode(message))))

@@ -114,7 +114,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
 
 
 def _of_agent(prepared: Prepared, replayed: Replayed, results: Results, agent_id: int) -> dict[str, Any]:
-    compared, counters = results.compared[agent_id], Counter(replayed.counts.members[agent_id])
+    compared, counters = results.compared[agent_id], Counter(replayed.counts.agents[agent_id])
     plan = prepared.inputs.plan
     vehicle = next(v for v in plan.vehicles if v.agent_id == agent_id)
     whole, settled = (_of_errors(compared.errors[name]) for name in (ALL, SETTLED))

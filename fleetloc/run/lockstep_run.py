@@ -7,6 +7,7 @@ from pathlib import Path
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.factory import make_estimator
 from fleetloc.output import progress_bar
@@ -35,8 +36,8 @@ def fly_in_lockstep(config: FleetConfig, directory: Path) -> Outcome:
         for agent_id in config.ids
     }
 
-    def on_estimate(agent_id: int, ready: EstimateReady) -> None:
-        recorders[agent_id].write(ready, ready.ready_s, 0.0)
+    def on_estimate(agent: OnboardAgent, ready: EstimateReady) -> None:
+        recorders[agent.agent_id].write(ready, ready.ready_s, 0.0)
 
     run = FleetLockstep(config, make_estimator, on_estimate)
     gc.collect()

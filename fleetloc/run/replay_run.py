@@ -24,6 +24,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.samples import AutopilotEstimate, GpsSample
 from estimators.factory import make_estimator
@@ -37,7 +38,6 @@ from sim_bridge.replay.logs.events import TruthSample
 from sim_bridge.replay.reading import read_beside
 from sim_bridge.replay.statistics import Thinned
 from sim_bridge.replay.tracks import TrackWriter
-from sim_bridge.virtual.lockstep_members import ObjectMember
 
 KINDS = ("truth", "autopilot", "gps", "gps_received")
 """References, each with a track per agent."""
@@ -113,7 +113,6 @@ class Results:
     """Writes the agents' estimates down, and notes what the cores know of their sensors' latency."""
 
     def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
-        self.members: dict[int, ObjectMember] = {}
         self.latency: dict[int, Thinned] = {}
         self._noted_s: dict[int, float] = {}
         self._recorders: dict[int, EstimateRecorder] = {}
@@ -129,12 +128,13 @@ class Results:
             record = run_files.record_path(directory, agent_id)
             self._recorders[agent_id] = EstimateRecorder(record, header, sys.maxsize)
 
-    def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
+    def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
         """Write an estimate, and note the latency now and then."""
+        agent_id = agent.agent_id
         self._recorders[agent_id].write(ready, ready.ready_s, 0.0)
         if ready.ready_s < self._noted_s.get(agent_id, 0.0) + LATENCY_EVERY_S:
             return
-        known = self.members[agent_id].core.gps_latency
+        known = agent.core.gps_latency
         if known.latency_s is not None and known.sigma_s is not None:
             self._noted_s[agent_id] = ready.ready_s
             row = np.array((ready.ready_s, known.latency_s, known.sigma_s))
@@ -153,7 +153,6 @@ def run_replay(prepared: Prepared, directory: Path) -> Replayed:
     feed = Feed(inputs, ReferenceTracks(directory, agents))
     results = Results(directory, config, agents)
     replay = Replay(config, feed, make_estimator, results.on_estimate)
-    results.members = replay.members
     gc.collect()
     gc.freeze()  # full collections over all modules would take a tenth of the time
     usual = gc.get_threshold()

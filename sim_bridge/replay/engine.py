@@ -14,12 +14,14 @@ from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
+from agent.onboard import OnboardAgent
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
 from sim_bridge.replay.feed import Arrival, Feed, Heard
 from sim_bridge.replay.range_files import RangeLine
-from sim_bridge.virtual.lockstep_members import ObjectMember
-from sim_bridge.virtual.virtual_fleet import EventQueue, OnEstimate, VirtualFleet
+from sim_bridge.virtual.event_queue import EventQueue
+from sim_bridge.virtual.virtual_fleet import OnEstimate, VirtualDrone, VirtualFleet, channel_of
 from transport.messages.uwb_body import UwbFrame, UwbRange
+from transport.security.auth import Identity
 
 AHEAD_S = 0.5
 """How far the streams are read ahead: more than a message of truth may be late."""
@@ -39,7 +41,7 @@ LINGER_TICKS = 2.0
 class ReplayCounts:
     """How it went: counters by agent and name as a daemon reports them, and what the replay itself left out."""
 
-    members: dict[int, dict[str, int]] = field(default_factory=dict)
+    agents: dict[int, dict[str, int]] = field(default_factory=dict)
     ranges: Counter[str] = field(default_factory=Counter)
     leaps: int = 0
     """Silences that were left out."""
@@ -59,16 +61,18 @@ class Replay:
         self._inputs = inputs = feed.inputs
         self._queue = EventQueue(inputs.from_s)
         agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
-        self.members = {agent_id: ObjectMember(config, agent_id, make_estimator) for agent_id in agents}
-        """By agent; for what is to be known of their cores after the run."""
-        self._fleet = VirtualFleet(
-            config,
-            {},
-            self._queue,
-            on_estimate,
-            fleet_offset_s=0.0,
-            unix_offset_s=config.fleet.epoch_unix_s,
-        )
+        epoch_s = config.fleet.epoch_unix_s
+        self.drones = {
+            agent_id: VirtualDrone(
+                OnboardAgent(
+                    config, agent_id, make_estimator, Identity(), unix_s=epoch_s, host_s=0.0, linked=False
+                ),
+                channel_of(config, agent_id),
+            )
+            for agent_id in agents
+        }
+        """By agent; for what is to be known of them after the run. Their monotonic clock is fleet time."""
+        self._fleet = VirtualFleet(config, self._queue, on_estimate, unix_offset_s=epoch_s)
         self._period_s = config.fleet.period_s
         self._ahead_s = AHEAD_OF_STAMPS_S if inputs.at_stamps else AHEAD_S
         self._left: set[int] = set()
@@ -107,7 +111,7 @@ class Replay:
             if last_s <= first_s:
                 self._left.add(vehicle.agent_id)
                 continue
-            self._queue.at(first_s, functools.partial(self._fleet.join, self.members[vehicle.agent_id]))
+            self._queue.at(first_s, functools.partial(self._fleet.join, self.drones[vehicle.agent_id]))
             self._queue.at(last_s, functools.partial(self._leave, vehicle.agent_id))
 
     def _leave(self, agent_id: int) -> None:
@@ -132,27 +136,26 @@ class Replay:
         if agent_id in self._left:
             self._counts.ranges["sample after its log's end"] += 1
             return
-        self.members[agent_id].core.on_sample(sample, self._queue.now_s)
+        self.drones[agent_id].agent.on_sample(sample, self._queue.now_s)
 
     def _on_range(self, line: RangeLine) -> None:
         """Hand a range to its observer as its UWB module would."""
-        member = self.members.get(line.observer)
-        if member is None or line.observer in self._left:
+        drone = self.drones.get(line.observer)
+        if drone is None or line.observer in self._left:
             self._counts.ranges["observer without a log"] += 1
             return
         self._sequence += 1
         measured = UwbRange(line.target, line.range_m, line.sigma_m)
         frame = UwbFrame(self._sequence, "unix", 0, (measured,), line.observer)
         now_s = self._queue.now_s
-        for sample in member.uwb.samples_of(frame, now_s - line.time_s, now_s):
-            member.core.on_range(sample, now_s)
+        drone.agent.on_uwb_frame(frame, now_s - line.time_s, now_s)
         self._counts.ranges["delivered"] += 1
 
     def _finished(self, last_s: float) -> ReplayCounts:
-        for agent_id, member in self.members.items():
-            counters = member.counters()
+        for agent_id, drone in self.drones.items():
+            counters = drone.counters()
             if self._feed.dropped[agent_id]:
                 counters["skipped gps: dropped on request"] = self._feed.dropped[agent_id]
-            self._counts.members[agent_id] = counters
+            self._counts.agents[agent_id] = counters
         self._counts.last_s = last_s
         return self._counts

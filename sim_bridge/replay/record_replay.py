@@ -24,6 +24,7 @@ from agent.log.flight_reader import FlightReader, RecordedInput
 from agent.log.mcap_record import EstimateMessage, estimate_message
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
+from transport.security.auth import Identity
 
 TOLERANCE = 1e-9
 """Differences of a mean or sigma up to this (m, m/s) are rounding."""
@@ -117,16 +118,19 @@ def _replay_one(
     if start.agent not in used.ids:
         raise RecordError(f"record {path}: of agent {start.agent}, expected one of {', '.join(map(str, used.ids))}")
     onboard = OnboardAgent(
-        used, start.agent, make_estimator, trust_from(start.trust), unix_s=start.unix_s, host_s=start.host_s
+        used,
+        start.agent,
+        make_estimator,
+        Identity(trust=trust_from(start.trust)),
+        unix_s=start.unix_s,
+        host_s=start.host_s,
     )
     result = RecordReplay(path, start.agent, used)
     pairing = _Pairing(result, on_tick)
     for entry in reader:
         if isinstance(entry, RecordedInput):
             result.inputs = entry.number
-            outputs = onboard.take(entry.event)
-            onboard.core.last_fault = None  # the daemon's log had it
-            for output in outputs:
+            for output in onboard.take(entry.event):
                 if isinstance(output, EstimateReady):
                     pairing.on_made(ReplayedTick(output, None, onboard.fleet_s(entry.event.host_s), entry.number))
         else:

@@ -1,157 +1,220 @@
 """The agents of a fleet in virtual time: their timers and the radio between them, as a queue of events.
 
-What feeds their sensors is somebody else's: the simulated world (`sim_bridge.virtual.fleet_lockstep`) or recorded
-flights (`sim_bridge.replay`). Nothing reads a clock: the same events in the same order give the same result.
+This is the shell of `agent.onboard.OnboardAgent` in virtual time, as `agent.daemon` is in real time: packets are
+sealed and opened as on the radio. What feeds the sensors is somebody else's: the simulated world
+(`sim_bridge.virtual.fleet_lockstep`), recorded flights (`sim_bridge.replay`) or a study (`sim_bridge.studies`).
+Nothing reads a clock: the same events in the same order give the same result.
 """
 
 from __future__ import annotations
 
 import functools
-import heapq
-import itertools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
 
 from agent.config.tables import FleetConfig
-from agent.outputs import EstimateReady, Output, Send
-from sim_bridge.virtual.lockstep_members import Member, Parcel
-from transport.messages.estimate_body import FleetEstimate
+from agent.onboard import OnboardAgent
+from agent.outputs import EstimateReady, HealthChanged, Output, Send, ToAutopilot
+from agent.radio.radio_faults import channel_settings
+from agent.watch.diagnostics import counters_of
+from sim_bridge.virtual.event_queue import EventQueue
+from transport.link.channel import Channel, Outage
+from transport.link.streams import Stream, key_expression
+from transport.security.sealing import Message
 
 AIR_S = 0.001
 """How long a packet takes between two agents before the configured loss and delay."""
+HOUSEKEEPING_S = 1.0
+HEARD_STREAMS = (Stream.MEAS, Stream.INFO)
+"""What agents listen to; estimates and diagnostics are for people."""
 
-OnEstimate = Callable[[int, EstimateReady], None]
+OnEstimate = Callable[[OnboardAgent, EstimateReady], None]
 """(agent, its estimate of a tick)."""
 
 
-class EventQueue:
-    """What is to be done when; ``now_s`` is the virtual monotonic clock."""
+class Tap(Protocol):
+    """Follows packets for a study; what `on_sent` returns comes back with every copy that is heard."""
 
-    def __init__(self, start_s: float) -> None:
-        self.now_s = start_s
-        self._events: list[tuple[float, int, Callable[[], None]]] = []
-        self._order = itertools.count()
+    def on_sent(self, sender: int, message: Message, size_bytes: int) -> Any:
+        """A packet goes on the air."""
 
-    def at(self, time_s: float, act: Callable[[], None]) -> None:
-        """Do something at a virtual time; what is due together is done in the order in which it was asked for."""
-        heapq.heappush(self._events, (time_s, next(self._order), act))
+    def on_heard(self, receiver: int, sent: Any) -> None:
+        """An agent gets it, after losses and delays."""
 
-    def run_until(self, last_s: float) -> None:
-        """Do everything that is due up to a time, in order."""
-        while self._events and self._events[0][0] <= last_s:
-            time_s, _, act = heapq.heappop(self._events)
-            self.now_s = max(self.now_s, time_s)
-            act()
 
-    def leap(self, to_s: float) -> None:
-        """Set the clock forward; what was due in between is done at once, late, when the queue goes on."""
-        self.now_s = max(self.now_s, to_s)
+@dataclass(frozen=True, slots=True)
+class Parcel:
+    """A packet on its way; ``sent`` is what the tap wants to have back."""
+
+    sender: int
+    key: str
+    data: bytes
+    arrived_s: float
+    sent: Any = None
+
+
+@dataclass(slots=True)
+class VirtualDrone:
+    """An agent, what it hears through, and how wrong its computer's UTC is."""
+
+    agent: OnboardAgent
+    channel: Channel[Parcel]
+    utc_error_s: float = 0.0
+    timer_s: float = math.inf
+    """When it is to be woken next, on the queue's clock."""
+
+    def counters(self) -> dict[str, int]:
+        """Those of a daemon that have a meaning here."""
+        return counters_of(self.agent) | {"injected losses": sum(self.channel.lost.values())}
+
+
+def channel_of(
+    config: FleetConfig, agent_id: int, *, outages: Sequence[Outage] = (), began_s: float | None = None
+) -> Channel[Parcel]:
+    """What ``[transport]`` does to packets for an agent, its outages counted from ``began_s``, and ``outages``."""
+    transport = config.transport
+    faults = channel_settings(
+        transport.faults,
+        agent_id,
+        loss=transport.loss,
+        delay_s=transport.delay_s,
+        delay_jitter_s=transport.delay_jitter_s,
+        began_s=began_s,
+        more=outages,
+    )
+    return Channel.seeded(faults, seed=transport.seed, receiver=agent_id, neighbours=config.neighbours(agent_id))
 
 
 class VirtualFleet:
-    """The members and the air between them; ``on_estimate`` gets every estimate in the order of their making.
+    """The drones and the air between them; ``on_estimate`` gets every estimate in the order of their making.
 
-    ``fleet_offset_s`` is fleet time, ``unix_offset_s`` Unix time less the queue's clock.
+    ``unix_offset_s`` is Unix time less the queue's clock; ``to_autopilot`` gets frames for an agent's autopilot,
+    ``on_health`` changes of its health. ``lateness_s`` draws how much later than asked for things happen.
     """
 
     def __init__(
         self,
         config: FleetConfig,
-        members: Mapping[int, Member],
         queue: EventQueue,
         on_estimate: OnEstimate,
         *,
-        fleet_offset_s: float,
         unix_offset_s: float,
+        to_autopilot: Callable[[int, bytes], None] | None = None,
+        on_health: Callable[[int, HealthChanged], None] | None = None,
+        tap: Tap | None = None,
+        lateness_s: Callable[[], float] = lambda: 0.0,
     ) -> None:
-        self._members = dict(members)
+        self.drones: dict[int, VirtualDrone] = {}
+        """Who is there, by agent."""
+        self._config = config
         self._queue = queue
         self._on_estimate = on_estimate
-        self._fleet_offset_s = fleet_offset_s
         self._unix_offset_s = unix_offset_s
+        self._to_autopilot = to_autopilot
+        self._on_health = on_health
+        self._tap = tap
+        self._lateness_s = lateness_s
         self._hearers = {i: config.neighbours(i) for i in config.ids}
-        self._timers: dict[int, float] = {}
-        """When each member is to be woken next, on the queue's clock."""
 
-    @property
-    def fleet_s(self) -> float:
-        """Fleet time now."""
-        return self._queue.now_s + self._fleet_offset_s
-
-    def advance(self, member: Member) -> None:
-        """Let a core do what is due; come back when it wants to."""
-        self._put_out(member, member.core.advance(self.fleet_s))
-        due_s = member.core.next_due_s()
-        if due_s is not None:
-            # a time that went through the offset may come out a hair early: the core then asks again
-            self._set_timer(member, max(due_s - self._fleet_offset_s, math.nextafter(self._queue.now_s, math.inf)))
-
-    def join(self, member: Member) -> None:
+    def join(self, drone: VirtualDrone) -> None:
         """An agent begins."""
-        self._members[member.agent_id] = member
-        self._timers.pop(member.agent_id, None)
-        self.advance(member)
+        self.drones[drone.agent.agent_id] = drone
+        self._later(HOUSEKEEPING_S, functools.partial(self._keep_house, drone))
+        self.advance(drone)
 
-    def leave(self, agent_id: int) -> None:
-        """An agent ends: nothing wakes it or reaches it any more, and its neighbours are told (liveliness)."""
-        del self._members[agent_id]
+    def leave(self, agent_id: int, *, told: bool = True) -> None:
+        """An agent ends: nothing wakes it or reaches it any more; its neighbours are ``told`` (liveliness)."""
+        del self.drones[agent_id]
         for hearer in self._hearers[agent_id]:
-            if hearer in self._members:
-                self._members[hearer].core.on_gone(agent_id)
-                self.advance(self._members[hearer])
+            if told and hearer in self.drones:
+                self.drones[hearer].agent.on_gone(agent_id, self._queue.now_s)
+                self.advance(self.drones[hearer])
 
-    def _set_timer(self, member: Member, host_s: float) -> None:
-        """Wake a member then, unless it will be woken before."""
-        if host_s < self._timers.get(member.agent_id, math.inf):
-            self._timers[member.agent_id] = host_s
-            self._queue.at(host_s, lambda: self._wake(member, host_s))
+    def advance(self, drone: VirtualDrone) -> None:
+        """Let an agent do what is due; come back when it wants to."""
+        self._carry_out(drone, drone.agent.advance(self._queue.now_s))
+        # a time that went through the clock's offset may come out a hair early: the agent is then asked again
+        due_s = max(drone.agent.next_due_host_s(), math.nextafter(self._queue.now_s, math.inf))
+        if due_s < drone.timer_s:
+            drone.timer_s = due_s
+            self._queue.at(due_s, lambda: self._wake(drone, due_s))
 
-    def _wake(self, member: Member, host_s: float) -> None:
-        """A timer that an earlier one has replaced does nothing, one that a packet has overtaken is set anew."""
-        if self._members.get(member.agent_id) is not member or self._timers.get(member.agent_id) != host_s:
-            return
-        del self._timers[member.agent_id]
-        due_s = member.core.next_due_s()
-        if due_s is None:
-            return
-        if due_s - self._fleet_offset_s <= math.nextafter(self._queue.now_s, math.inf):
-            self.advance(member)
-        else:
-            self._set_timer(member, due_s - self._fleet_offset_s)
+    def unix_ns(self, drone: VirtualDrone) -> int:
+        """UTC as a drone's computer has it."""
+        return round((self._queue.now_s + self._unix_offset_s + drone.utc_error_s) * 1e9)
 
-    def _put_out(self, member: Member, outputs: list[Output]) -> None:
-        for output in outputs:
-            if isinstance(output, EstimateReady):
-                self._on_estimate(member.agent_id, output)
-            elif isinstance(output, Send) and not isinstance(output.message, FleetEstimate):
-                # estimates are for people: no agent listens to them
-                for parcel in member.pack(output.message, self._unix_ns):
-                    self._transmit(member.agent_id, parcel)
-
-    @property
-    def _unix_ns(self) -> int:
-        return round((self._queue.now_s + self._unix_offset_s) * 1e9)
-
-    def _transmit(self, sender: int, parcel: Parcel) -> None:
-        arrival_s = self._queue.now_s + AIR_S
+    def transmit(self, sender: int, stream: Stream, data: bytes, sent: Any = None) -> None:
+        """A packet goes out to all neighbours."""
+        key = key_expression(self._config.fleet.name, sender, stream)
         for hearer in self._hearers[sender]:
-            self._queue.at(arrival_s, functools.partial(self._arrive, hearer, sender, parcel))
+            self._later(AIR_S, functools.partial(self._arrive, hearer, sender, key, data, sent))
 
-    def _arrive(self, hearer: int, sender: int, parcel: Parcel) -> None:
-        receiver = self._members.get(hearer)
+    # --- events ---------------------------------------------------------------------------------------------
+
+    def _is_there(self, drone: VirtualDrone) -> bool:
+        return self.drones.get(drone.agent.agent_id) is drone
+
+    def _later(self, after_s: float, act: Callable[[], None]) -> None:
+        self._queue.at(self._queue.now_s + after_s + self._lateness_s(), act)
+
+    def _wake(self, drone: VirtualDrone, timer_s: float) -> None:
+        """A timer that an earlier one has replaced does nothing, one that a packet has overtaken is set anew."""
+        if self._is_there(drone) and drone.timer_s == timer_s:
+            drone.timer_s = math.inf
+            self.advance(drone)
+
+    def _carry_out(self, drone: VirtualDrone, outputs: Sequence[Output]) -> None:
+        """Everything that an agent wants done is done here."""
+        agent_id = drone.agent.agent_id
+        for output in outputs:
+            match output:
+                case Send():
+                    self._send(agent_id, output)
+                case ToAutopilot() if self._to_autopilot is not None:
+                    for frame in output.frames:
+                        self._to_autopilot(agent_id, frame)
+                case EstimateReady():
+                    self._on_estimate(drone.agent, output)
+                case HealthChanged() if self._on_health is not None:
+                    self._on_health(agent_id, output)
+
+    def _send(self, sender: int, output: Send) -> None:
+        for packet in output.packets:
+            sent = None if self._tap is None else self._tap.on_sent(sender, output.message, len(packet.data))
+            if packet.stream in HEARD_STREAMS:
+                self.transmit(sender, packet.stream, packet.data, sent)
+
+    def _arrive(self, hearer: int, sender: int, key: str, data: bytes, sent: Any) -> None:
+        receiver = self.drones.get(hearer)
         if receiver is not None:
-            receiver.channel.offer(sender, parcel, self._queue.now_s)
+            receiver.channel.offer(sender, Parcel(sender, key, data, self._queue.now_s, sent), self._queue.now_s)
             self._deliver(receiver)
 
-    def _deliver(self, receiver: Member) -> None:
+    def _deliver(self, receiver: VirtualDrone) -> None:
         """Hand on what the channel lets through by now, and come back for what it delays."""
-        if self._members.get(receiver.agent_id) is not receiver:
+        if not self._is_there(receiver):
             return
         for _, parcel in receiver.channel.due(self._queue.now_s):
-            received = receiver.unpack(parcel, self._queue.now_s, self._unix_ns)
-            if received is not None:
-                receiver.core.on_packet(received, self.fleet_s)
-                self.advance(receiver)
+            receiver.agent.on_packet(
+                parcel.key,
+                parcel.data,
+                arrived_s=parcel.arrived_s,
+                host_s=self._queue.now_s,
+                unix_ns=self.unix_ns(receiver),
+            )
+            if self._tap is not None:
+                self._tap.on_heard(receiver.agent.agent_id, parcel.sent)
+            self.advance(receiver)
         due_s = receiver.channel.next_due()
         if due_s is not None:
             self._queue.at(due_s, lambda: self._deliver(receiver))
+
+    def _keep_house(self, drone: VirtualDrone) -> None:
+        if not self._is_there(drone):
+            return
+        unix_s = self._queue.now_s + self._unix_offset_s + drone.utc_error_s
+        self._carry_out(drone, drone.agent.keep_house(unix_s=unix_s, host_s=self._queue.now_s))
+        self.advance(drone)
+        self._later(HOUSEKEEPING_S, functools.partial(self._keep_house, drone))

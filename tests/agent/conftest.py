@@ -1,8 +1,7 @@
-"""A fleet in virtual time: drones on known curves, perfect or noisy sensors, and the wire between cores."""
+"""A small fleet's configuration, and an autopilot that streams what it is asked for."""
 
 from __future__ import annotations
 
-import math
 import socket
 import tomllib
 from collections import defaultdict
@@ -11,23 +10,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 import pytest
 
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig
-from agent.core import AgentCore
 from agent.mavlink.codec import Decoder, Encoder, mavlink
-from agent.outputs import EstimateReady, HealthChanged, Output, Send
-from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample
-from estimators.factory import make_estimator
 from tests.support.ports import HOST, free_ports
-from transport.link.streams import key_expression
-from transport.security.auth import UNSIGNED
-from transport.security.opening import Opener
-from transport.security.sealing import Sealer
 
-GRAVITY_MPS2 = 9.80665
 CONFIG = """
 [fleet]
 name = "test"
@@ -56,111 +45,6 @@ def fleet_config(count: int = 3, *overrides: str) -> FleetConfig:
     document: dict[str, Any] = tomllib.loads(CONFIG)
     document["agents"] = [{"id": i, "mavlink": f"udpin:127.0.0.1:{15000 + i}"} for i in range(1, count + 1)]
     return config_from(document, "test", overrides)
-
-
-def position_of(agent_id: int, t_s: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """True position, velocity and acceleration: circles of 4 m, each agent its own centre and phase."""
-    rate, radius, phase = 2 * math.pi / 20, 4.0, 1.3 * agent_id
-    angle = rate * t_s + phase
-    centre = np.array([6.0 * math.cos(2.1 * agent_id), 6.0 * math.sin(2.1 * agent_id), -5.0 - agent_id])
-    unit, across = (
-        np.array([math.cos(angle), math.sin(angle), 0.0]),
-        np.array([-math.sin(angle), math.cos(angle), 0]),
-    )
-    return centre + radius * unit, radius * rate * across, -radius * rate**2 * unit
-
-
-@dataclass
-class VirtualFleet:
-    """Cores joined by a wire with a delay, in steps of 5 ms; ``deaf`` are (sender, receiver) pairs cut off."""
-
-    config: FleetConfig
-    start_s: float = 1000.0
-    delay_s: float = 0.004
-    noise: bool = True
-    blind: Callable[[int, float], bool] = lambda agent_id, t_s: False
-    cut: Callable[[int, int, float], bool] = lambda sender, receiver, t_s: False
-    factory: Any = make_estimator
-    seed: int = 1
-    estimates: dict[int, list[EstimateReady]] = field(default_factory=dict)
-    health: dict[int, list[str]] = field(default_factory=dict)
-
-    def __post_init__(self) -> None:
-        ids = self.config.ids
-        self.cores = {i: self.new_core(i) for i in ids}
-        self.sealers = {i: Sealer("test", i, boot=1, signing=UNSIGNED) for i in ids}
-        self.openers = {i: Opener("test", ids, UNSIGNED, own_id=i) for i in ids}
-        self.estimates = {i: [] for i in ids}
-        self.health = {i: [] for i in ids}
-        self.rng = np.random.default_rng(self.seed)
-        self.wire: list[tuple[float, int, int, str, bytes]] = []
-        self.now_s = self.start_s
-        self.steps = 0
-
-    def new_core(self, agent_id: int) -> AgentCore:
-        core = AgentCore(self.config, agent_id, self.factory)
-        core.autopilot_state = "connected"
-        return core
-
-    def run(self, duration_s: float) -> None:
-        for _ in range(round(duration_s / 0.005)):
-            self.steps += 1
-            self.now_s = self.start_s + 0.005 * self.steps
-            for agent_id, core in list(self.cores.items()):
-                self.sense(agent_id, core)
-            self.deliver()
-            for agent_id, core in list(self.cores.items()):
-                self.handle(agent_id, core.advance(self.now_s))
-
-    def sense(self, agent_id: int, core: AgentCore) -> None:
-        t_s = self.now_s
-        p, v, a = position_of(agent_id, t_s)
-        if self.steps % 2 == 0:
-            force = a - np.array([0.0, 0.0, GRAVITY_MPS2]) + self.uniform(0.05, 3)
-            core.on_imu(ImuSample(t_s, tuple(force), (0.0, 0.0, 0.0)), t_s)
-        if self.steps % 4 == 0:
-            core.on_attitude(AttitudeSample(t_s, (1.0, 0.0, 0.0, 0.0)), t_s)
-        if self.steps % 20 == 3 and not self.blind(agent_id, t_s):
-            fix = tuple(p + self.uniform(0.15, 3))
-            speed = float(np.linalg.norm(v) + self.uniform(0.08, 1)[0])
-            core.on_gps(GpsSample(t_s, fix, 0.3, 0.5, None, speed, 0.1, 3), t_s)
-        if self.steps % 20 == 5 + agent_id:
-            for other in self.config.neighbours(agent_id):
-                distance = np.linalg.norm(p - position_of(other, t_s)[0]) + self.uniform(0.1, 1)[0]
-                core.on_range(RangeSample(t_s, agent_id, other, float(distance), 0.1), t_s)
-
-    def uniform(self, half_width: float, count: int) -> np.ndarray:
-        drawn = self.rng.uniform(-half_width, half_width, count)
-        return drawn if self.noise else np.zeros(count)
-
-    def deliver(self) -> None:
-        due = [entry for entry in self.wire if entry[0] <= self.now_s]
-        self.wire = [entry for entry in self.wire if entry[0] > self.now_s]
-        for _, sender, receiver, key, data in due:
-            if receiver not in self.cores or self.cut(sender, receiver, self.now_s):
-                continue
-            received = self.openers[receiver].open(key, data, now=self.now_s, unix_ns=0)
-            if received is not None:
-                self.cores[receiver].on_packet(received, self.now_s)
-
-    def handle(self, agent_id: int, outputs: list[Output]) -> None:
-        for output in outputs:
-            if isinstance(output, EstimateReady):
-                self.estimates[agent_id].append(output)
-            elif isinstance(output, HealthChanged):
-                self.health[agent_id].append(str(output.health))
-            elif isinstance(output, Send):
-                for packet in self.sealers[agent_id].seal(output.message, t_ns=0):
-                    key = key_expression("test", agent_id, packet.stream)
-                    for other in self.config.neighbours(agent_id):
-                        self.wire.append((self.now_s + self.delay_s, agent_id, other, key, packet.data))
-
-    def own_error_m(self, agent_id: int, skip: int = 0) -> np.ndarray:
-        """Norm of the own position's error, estimate by estimate."""
-        slot = self.config.ids.index(agent_id)
-        own = slice(6 * slot, 6 * slot + 3)
-        ready = self.estimates[agent_id][skip:]
-        return np.array([np.linalg.norm(r.estimate.mean[own] - position_of(agent_id, r.t_s)[0]) for r in ready])
 
 
 HIGHRES, RAW, QUATERNION = 105, 27, 31
@@ -230,11 +114,6 @@ class VirtualAutopilot:
 @pytest.fixture
 def make_config() -> Callable[..., FleetConfig]:
     return fleet_config
-
-
-@pytest.fixture
-def virtual_fleet() -> type[VirtualFleet]:
-    return VirtualFleet
 
 
 @pytest.fixture

@@ -2,24 +2,17 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
-from agent.core import AgentCore
-from agent.outputs import EstimateReady, Send
+from agent.outputs import EstimateReady, Tell
 from agent.sensing.samples import ImuSample, RangeSample
 from estimators.estimator import Status
-from estimators.factory import make_estimator
+from tests.support.circling_fleet import CirclingFleet
 from tests.support.notebook_estimator import MakeConfig, Notebook, fix, lone, received, tick_through
+from tests.support.onboard import CONNECTED, onboard_of
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurements, PositionRecord
-from transport.security.sealing import Sealer
-
-Fleet = Any
-"""The `VirtualFleet` of conftest.py."""
-
 
 # --- one core ----------------------------------------------------------------------------------------------
 
@@ -30,7 +23,7 @@ def test_each_tick_is_begun_mixed_and_solved_once_in_order(make_config: MakeConf
     calls = [call[:2] for call in made[0].calls]
     expected = [[("begin", tick), ("mix", 0), ("mix", 1)] for tick in range(1000, 1009)]
     assert calls == [call for tick in expected for call in tick]
-    sent = [type(o.message).__name__ for o in outputs if isinstance(o, Send)]
+    sent = [type(o.message).__name__ for o in outputs if isinstance(o, Tell)]
     assert sent[:4] == ["Measurements", "Information", "Information", "FleetEstimate"]
     ready = [o for o in outputs if isinstance(o, EstimateReady)]
     assert [r.estimate.tick for r in ready] == list(range(1000, 1009))
@@ -40,7 +33,7 @@ def test_each_tick_is_begun_mixed_and_solved_once_in_order(make_config: MakeConf
 
 def test_rows_of_a_tick_come_with_it_and_its_input_with_the_next(make_config: MakeConfig) -> None:
     core, made = lone(make_config)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_gps(fix(100.13), 100.18)
     core.on_gps(fix(100.17), 100.18)
     tick_through(core, 100.18, 0.4)
@@ -65,16 +58,16 @@ def test_a_fix_that_comes_late_keeps_its_place(make_config: MakeConfig) -> None:
 def test_the_next_due_time_is_when_something_happens(make_config: MakeConfig) -> None:
     core, _ = lone(make_config, count=2)
     assert core.next_due_s() is None
-    assert core.advance(100.05) == []
+    assert core.advance(100.05, CONNECTED) == []
     due_s = core.next_due_s()
     assert due_s == pytest.approx(100.11)
-    assert core.advance(due_s - 1e-6) == []
-    assert isinstance(next(iter(core.advance(due_s))), Send)
+    assert core.advance(due_s - 1e-6, CONNECTED) == []
+    assert isinstance(next(iter(core.advance(due_s, CONNECTED))), Tell)
 
 
 def test_samples_of_wrong_times_are_counted_and_unused(make_config: MakeConfig) -> None:
     core, made = lone(make_config)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_gps(fix(90.0), 100.01)
     core.on_gps(fix(102.0), 100.01)
     core.on_gps(fix(float("nan")), 100.01)
@@ -99,7 +92,7 @@ def test_after_a_long_sleep_the_ticks_between_are_left_out(make_config: MakeConf
 def test_a_short_stall_is_made_up_tick_by_tick_and_reported_late(make_config: MakeConfig) -> None:
     core, made = lone(make_config)
     tick_through(core, 100.0, 0.5)
-    outputs = core.advance(102.0)
+    outputs = core.advance(102.0, CONNECTED)
     ready = [o for o in outputs if isinstance(o, EstimateReady)]
     assert [r.estimate.tick for r in ready] == list(range(1004, 1019))
     assert [r.on_time for r in ready] == [False] * 14 + [True]
@@ -108,7 +101,7 @@ def test_a_short_stall_is_made_up_tick_by_tick_and_reported_late(make_config: Ma
 
 
 def test_before_any_position_the_estimate_says_no_data(make_config: MakeConfig) -> None:
-    core = AgentCore(make_config(2), 1, Notebook)
+    core = onboard_of(make_config(2), Notebook).core
     ready = [o for o in tick_through(core, 100.0, 20.0) if isinstance(o, EstimateReady)]
     assert {r.estimate.status for r in ready} == {Status.NO_DATA}
     assert (ready[0].estimate.covariance.diagonal() >= 1e8).all()
@@ -127,36 +120,36 @@ def information(
 
 def test_measurements_are_waited_for_until_they_come_or_their_time_is_over(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_packet(received(2, Measurements(999, ())), 100.01)
-    core.advance(100.115)
+    core.advance(100.115, CONNECTED)
     assert made == []  # neighbour 2 is heard, its tick 1000 is not there yet
     core.on_packet(received(2, Measurements(1000, (PositionRecord(2, 1000, (1, 2, 3), (1, 1, 1)),))), 100.118)
-    core.advance(100.118)
+    core.advance(100.118, CONNECTED)
     assert made[0].calls[0][2]["agent"].tolist() == [1, 1, 1]
-    core.advance(100.2)
-    core.advance(100.225)
+    core.advance(100.2, CONNECTED)
+    core.advance(100.225, CONNECTED)
     assert len(made[0].calls) == 2
-    assert core.advance(100.231) != []  # exchange deadline: 0.3 of the period after the end
+    assert core.advance(100.231, CONNECTED) != []  # exchange deadline: 0.3 of the period after the end
 
 
 def test_a_neighbour_that_left_is_not_waited_for(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_packet(received(2, Measurements(999, ())), 100.01)
-    core.advance(100.115)
+    core.advance(100.115, CONNECTED)
     core.on_gone(2)
-    core.advance(100.116)
+    core.advance(100.116, CONNECTED)
     assert made[0].calls[-1][:2] == ("mix", 0)
 
 
 def test_information_is_mixed_by_slot_in_its_round_and_late_counted(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_packet(received(2, information(999)), 100.0)
     core.on_packet(received(2, Measurements(1000, ())), 100.1)
     core.on_packet(received(2, information(1000)), 100.11)
-    core.advance(100.115)
+    core.advance(100.115, CONNECTED)
     assert made[0].calls[-1] == ("mix", 0, (1,))
     core.on_packet(received(2, information(1000)), 100.12)
     assert core.counters["information: late"] >= 1
@@ -164,10 +157,10 @@ def test_information_is_mixed_by_slot_in_its_round_and_late_counted(make_config:
 
 def test_information_about_another_window_is_left_out(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     core.on_packet(received(2, information(1000, state_tick=998)), 100.1)
     core.on_packet(received(2, Measurements(1000, ())), 100.1)
-    core.advance(100.115)
+    core.advance(100.115, CONNECTED)
     assert made[0].calls[-1] == ("mix", 0, ())
     assert core.counters["information: other window"] == 1
 
@@ -178,11 +171,11 @@ def test_information_about_other_members_is_mapped_and_used_once(
 ) -> None:
     # GIVEN a neighbour that sees another fleet than we do, WHEN its pair comes twice
     core, made = lone(make_config, "estimator.kind=dmhe_relay", count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     for _ in range(2):
         core.on_packet(received(2, information(1000, agents=agents)), 100.1)
     core.on_packet(received(2, Measurements(1000, ())), 100.1)
-    core.advance(100.115)
+    core.advance(100.115, CONNECTED)
     # THEN the estimator gets it once, in its own layout
     assert made[0].calls[-1] == ("mix", 0, (1,))
     assert made[0].mixed[1].information.shape == (12, 12)
@@ -199,13 +192,13 @@ def test_strangers_are_not_listened_to(make_config: MakeConfig) -> None:
 
 def test_a_neighbour_with_a_wrong_clock_harms_nobody(make_config: MakeConfig) -> None:
     core, made = lone(make_config, count=2)
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     for k in range(30):
         now_s = 100.0 + 0.01 * k
         wrong = 5000 + k
         core.on_packet(received(2, Measurements(wrong, (PositionRecord(2, wrong, (1, 2, 3), (1, 1, 1)),))), now_s)
         core.on_packet(received(2, information(wrong)), now_s)
-        core.advance(now_s)
+        core.advance(now_s, CONNECTED)
     assert core.records.refused["heard: of the future"] == 30
     assert core.counters["information: wild"] == 30
     assert [call[1] for call in made[0].calls if call[0] == "begin"] == [1000, 1001]
@@ -216,8 +209,8 @@ def test_a_neighbour_with_a_wrong_clock_harms_nobody(make_config: MakeConfig) ->
 
 
 @pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf"])
-def test_a_fleet_finds_itself_and_stays_on_time(virtual_fleet: Fleet, make_config: MakeConfig, kind: str) -> None:
-    fleet = virtual_fleet(make_config(3, f"estimator.kind={kind}"))
+def test_a_fleet_finds_itself_and_stays_on_time(make_config: MakeConfig, kind: str) -> None:
+    fleet = CirclingFleet(make_config(3, f"estimator.kind={kind}"))
     fleet.run(8)
     for agent_id in fleet.config.ids:
         ready = fleet.estimates[agent_id]
@@ -232,9 +225,7 @@ def test_a_fleet_finds_itself_and_stays_on_time(virtual_fleet: Fleet, make_confi
 
 @pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf", "dmhe"])
 def test_ticks_without_any_measurement_are_no_fault(make_config: MakeConfig, kind: str) -> None:
-    core = AgentCore(
-        make_config(2, f"estimator.kind={kind}", "initial.position_m=[1.0, 2.0, -3.0]"), 1, make_estimator
-    )
+    core = onboard_of(make_config(2, f"estimator.kind={kind}", "initial.position_m=[1.0, 2.0, -3.0]")).core
     ready = [o for o in tick_through(core, 100.0, 2.0) if isinstance(o, EstimateReady)]
     assert core.counters["estimator faults"] == 0
     assert all(np.isfinite(r.estimate.mean).all() for r in ready)
@@ -242,10 +233,10 @@ def test_ticks_without_any_measurement_are_no_fault(make_config: MakeConfig, kin
     assert sigma == sorted(sigma)
 
 
-def test_the_same_run_twice_is_bit_equal(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+def test_the_same_run_twice_is_bit_equal(make_config: MakeConfig) -> None:
     runs = []
     for _ in range(2):
-        fleet = virtual_fleet(make_config(3))
+        fleet = CirclingFleet(make_config(3))
         fleet.run(3)
         runs.append([r.estimate for i in fleet.config.ids for r in fleet.estimates[i]])
     for first, second in zip(*runs, strict=True):
@@ -254,8 +245,8 @@ def test_the_same_run_twice_is_bit_equal(virtual_fleet: Fleet, make_config: Make
         assert np.array_equal(first.covariance, second.covariance)
 
 
-def test_a_drone_without_gps_lives_on_its_neighbours(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
-    fleet = virtual_fleet(make_config(4), blind=lambda agent_id, t_s: agent_id == 4 and t_s > 1004)
+def test_a_drone_without_gps_lives_on_its_neighbours(make_config: MakeConfig) -> None:
+    fleet = CirclingFleet(make_config(4), blind=lambda agent_id, t_s: agent_id == 4 and t_s > 1004)
     fleet.run(12)
     assert fleet.own_error_m(4)[60:].max() < 1.5
     assert "no GPS" in fleet.health[4][-1]
@@ -263,10 +254,10 @@ def test_a_drone_without_gps_lives_on_its_neighbours(virtual_fleet: Fleet, make_
 
 
 def test_a_drone_that_never_had_gps_says_so_until_its_ranges_leave_one_place(
-    virtual_fleet: Fleet, make_config: MakeConfig
+    make_config: MakeConfig
 ) -> None:
     config = make_config(5, "initial.max_wait_s=2.0", "estimator.kind=dmhe_relay", "estimator.window=4")
-    fleet = virtual_fleet(config, blind=lambda agent_id, t_s: agent_id == 5)
+    fleet = CirclingFleet(config, blind=lambda agent_id, t_s: agent_id == 5)
     fleet.run(9)
     statuses = [r.estimate.status for r in fleet.estimates[5]]
     assert statuses[0] is Status.NO_DATA
@@ -279,14 +270,13 @@ def test_a_drone_that_never_had_gps_says_so_until_its_ranges_leave_one_place(
     assert fleet.health[5][-1] == "degraded: no GPS"
 
 
-def test_a_dead_neighbour_costs_no_tick_and_is_taken_back(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
-    fleet = virtual_fleet(make_config(3))
+def test_a_dead_neighbour_costs_no_tick_and_is_taken_back(make_config: MakeConfig) -> None:
+    fleet = CirclingFleet(make_config(3))
     fleet.run(4)
-    del fleet.cores[2]
+    fleet.kill(2)
     fleet.run(4)
     assert "not heard: 2" in fleet.health[1][-1]
-    fleet.cores[2] = fleet.new_core(2)
-    fleet.sealers[2] = Sealer("test", 2, boot=2, signing=fleet.sealers[1]._signing)
+    fleet.start(2)
     fleet.run(4)
     for survivor in (1, 3):
         ready = fleet.estimates[survivor]
@@ -297,9 +287,9 @@ def test_a_dead_neighbour_costs_no_tick_and_is_taken_back(virtual_fleet: Fleet, 
     assert fleet.own_error_m(2)[-10:].max() < 0.5
 
 
-def test_lost_packets_are_repaired_by_those_after_them(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+def test_lost_packets_are_repaired_by_those_after_them(make_config: MakeConfig) -> None:
     rng = np.random.default_rng(3)
-    fleet = virtual_fleet(
+    fleet = CirclingFleet(
         make_config(3, "estimator.kind=dmhe_pre_ekf", "estimator.window=4"), cut=lambda *_: rng.random() < 0.5
     )
     fleet.run(8)
@@ -313,8 +303,8 @@ def test_lost_packets_are_repaired_by_those_after_them(virtual_fleet: Fleet, mak
         assert of_other >= 36  # at 50 % loss single packets would have brought 20 of 40
 
 
-def test_a_partition_is_survived_and_healed(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
-    fleet = virtual_fleet(make_config(3), cut=lambda s, r, t_s: 1003 < t_s < 1007 and 1 in (s, r))
+def test_a_partition_is_survived_and_healed(make_config: MakeConfig) -> None:
+    fleet = CirclingFleet(make_config(3), cut=lambda s, r, t_s: 1003 < t_s < 1007 and 1 in (s, r))
     fleet.run(6.5)
     assert "not heard: 2, 3" in fleet.health[1][-1]
     fleet.run(3.5)
@@ -324,9 +314,9 @@ def test_a_partition_is_survived_and_healed(virtual_fleet: Fleet, make_config: M
         assert fleet.own_error_m(agent_id, skip=30).mean() < 0.3
 
 
-def test_packets_later_than_their_tick_are_still_used(virtual_fleet: Fleet, make_config: MakeConfig) -> None:
+def test_packets_later_than_their_tick_are_still_used(make_config: MakeConfig) -> None:
     config = make_config(3, "estimator.kind=dmhe_pre_ekf", "estimator.window=4")
-    fleet = virtual_fleet(config, delay_s=0.12)
+    fleet = CirclingFleet(config, delay_s=0.12)
     fleet.run(6)
     for agent_id, core in fleet.cores.items():
         assert core.counters["measurements: late"] > 40

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from agent.outputs import EstimateReady
+from agent.outputs import EstimateReady, Faulted
 from estimators.estimator import Status
 from tests.support.notebook_estimator import MakeConfig, lone, tick_through
+from tests.support.onboard import CONNECTED
 
 Patch = pytest.MonkeyPatch
 
@@ -26,11 +27,12 @@ def test_a_broken_estimator_falls_back_and_starts_anew(
         if (what, tick) == (call, 1003):
             raise fault
 
-    core.advance(100.0)
+    core.advance(100.0, CONNECTED)
     tick_through(core, 100.0, 0.25)
     made[0].fail = fail
     made[0].mean[3] = 3.0
-    ready = [o for o in tick_through(core, 100.25, 0.5) if isinstance(o, EstimateReady)]
+    outputs = tick_through(core, 100.25, 0.5)
+    ready = [o for o in outputs if isinstance(o, EstimateReady)]
     statuses = {r.estimate.tick: r.estimate.status for r in ready}
     assert statuses[1003] is Status.FELL_BACK
     assert all(status is Status.OK for tick, status in statuses.items() if tick != 1003)
@@ -39,7 +41,9 @@ def test_a_broken_estimator_falls_back_and_starts_anew(
     assert fallen.mean[:3] == pytest.approx([0.3, 0.0, 0.0])  # one tick further at 3 m/s
     assert fallen.covariance[0, 0] == pytest.approx(made[0].covariance[0, 0] + 1.0)
     assert core.counters[counter] == 1
-    assert core.last_fault is fault
+    [told] = [o for o in outputs if isinstance(o, Faulted)]
+    assert told.error is fault
+    assert told.of_estimator is (counter == "estimator faults")
 
 
 def test_an_estimate_that_is_not_finite_never_gets_out(make_config: MakeConfig) -> None:
@@ -67,7 +71,7 @@ def test_no_fault_holds_up_a_core_for_longer_than_a_tick(make_config: MakeConfig
         raised = []
         for step in range(50):
             try:
-                core.advance(100.25 + 0.01 * step)
+                core.advance(100.25 + 0.01 * step, CONNECTED)
             except RuntimeError as error:
                 raised.append(str(error))
     assert 3 <= len(raised) <= 5

@@ -16,10 +16,11 @@ from typing import Any
 import pytest
 
 from agent.config.reading import dump
-from agent.daemon import Daemon
+from agent.daemon import Daemon, Periods
 from agent.exit_codes import ExitCode
 from agent.log.estimate_log import read_record
 from agent.mavlink.codec import Encoder, mavlink
+from agent.outputs import ClockStepped
 from agent.watch.observers import DaemonState, Observer
 from estimators.estimator import Status
 from estimators.factory import make_estimator
@@ -90,7 +91,7 @@ async def test_two_daemons_find_their_autopilots_and_each_other(
     await until(lambda: "not heard: 2" in str(daemons[0].core.health.health), "2 has left")
     flights[0].cancel()  # the autopilot is gone; the daemon goes on
     ticks = daemons[0].core.counters["ticks"]
-    await until(lambda: daemons[0].core.autopilot_state == "lost", "the lost autopilot")
+    await until(lambda: daemons[0].onboard.link_state == "lost", "the lost autopilot")
     assert daemons[0].core.counters["ticks"] > ticks
     daemons[0].stop()
     await asyncio.wait_for(runs[0], PATIENCE_S)
@@ -116,7 +117,7 @@ async def test_a_lost_autopilot_ends_the_daemon_only_where_that_is_asked_for(
     # THEN it ends by itself, as if it had been told to, and its record is whole
     await asyncio.wait_for(running, PATIENCE_S)
     await asyncio.gather(flight, return_exceptions=True)
-    assert daemon.core.autopilot_state == "lost"
+    assert daemon.onboard.link_state == "lost"
     assert len(read_record(tmp_path / "rec" / "agent_001.estimates")[1]) == daemon.core.counters["ticks"]
 
 
@@ -146,7 +147,6 @@ async def test_a_connection_on_which_the_autopilot_falls_silent_is_made_anew(
 ) -> None:
     """Its end may have vanished without a word: a connection does not tell."""
     monkeypatch.setattr("agent.mavlink.link.REOPEN_S", 0.02)
-    monkeypatch.setattr("agent.daemon.RENEW_PERIOD_S", 0.1)
     open_ends: list[asyncio.StreamWriter] = []
     # GIVEN an autopilot behind TCP that says one thing on the first two connections, and then nothing
     beat = mavlink.MAVLink_heartbeat_message(2, mavlink.MAV_AUTOPILOT_PX4, 0, 0, 4, 3)
@@ -160,11 +160,12 @@ async def test_a_connection_on_which_the_autopilot_falls_silent_is_made_anew(
     port = server.sockets[0].getsockname()[1]
     link = f"agents.1.mavlink=tcpout:{HOST}:{port}"
     config = config_of(1, "security.mode=unsigned", link, "mavlink.heartbeat_timeout_s=1.5")
-    daemon = Daemon(config, 1, make_estimator, Path())
+    often = Periods(housekeeping_s=0.05, renew_link_s=0.1)
+    daemon = Daemon(config, 1, make_estimator, Path(), periods=often)
     running = asyncio.create_task(daemon.run())
     # WHEN it is lost THEN it is dialled again; is it still lost, once more after a while
-    await until(lambda: daemon.core.autopilot_state == "lost", "the silence")
-    await until(lambda: daemon.core.autopilot_state == "connected", "a second connection")
+    await until(lambda: daemon.onboard.link_state == "lost", "the silence")
+    await until(lambda: daemon.onboard.link_state == "connected", "a second connection")
     await until(lambda: len(open_ends) >= 4, "a third and a fourth")
     daemon.stop()
     await asyncio.wait_for(running, PATIENCE_S)
@@ -177,8 +178,9 @@ async def test_a_fault_of_the_core_ends_no_task_wherever_it_is_called_from(
     config_of: Any, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     # GIVEN a daemon whose clock questions are answered at once, from within its housekeeping
-    monkeypatch.setattr("agent.daemon.HOUSEKEEPING_PERIOD_S", 0.05)
-    daemon, asked = Daemon(config_of(1, "security.mode=unsigned"), 1, make_estimator, Path()), 0
+    asked = 0
+    config, often = config_of(1, "security.mode=unsigned"), Periods(housekeeping_s=0.05)
+    daemon = Daemon(config, 1, make_estimator, Path(), periods=often)
 
     async def ask_clocks() -> None:
         nonlocal asked
@@ -195,9 +197,9 @@ async def test_a_fault_of_the_core_ends_no_task_wherever_it_is_called_from(
         raise RuntimeError("a bug in the core")
 
     with monkeypatch.context() as broken:
-        for name in ("advance", "on_packet", "on_gone", "on_uwb", "on_mavlink", "serve_autopilot"):
+        for name in ("advance", "on_packet", "on_gone", "on_uwb", "on_mavlink"):
             broken.setattr(core, name, fails)
-        broken.setattr(core, "keep_house", lambda **_: True)
+        broken.setattr(core, "keep_house", lambda **_: [ClockStepped()])
         asked = 0
         daemon._on_packet("cl/v1/test/agent/002/meas", b"", 0.0, 0)
         daemon._on_gone(2)
@@ -325,11 +327,10 @@ def check_records(directory: Path) -> None:
 
 SCRIPT = """
 import sys
-from agent.config import load_config
+from agent.config.reading import load_config
 from agent.daemon import run
-from agent.logs import configure_logging
+from agent.watch.log_lines import configure_logging
 from estimators.factory import make_estimator
-from transport.keys import init_keys
 configure_logging(1)
 sys.exit(run(load_config(sys.argv[1]), 1, make_estimator))
 """

@@ -28,7 +28,7 @@ from agent.warmup import warm_up
 from agent.watch.health import State
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from transport.security.auth import UNSIGNED
+from transport.security.auth import Identity
 
 MakeConfig = Callable[..., FleetConfig]
 
@@ -78,7 +78,7 @@ def test_a_host_that_was_never_told_the_time_is_no_fault_of_the_epoch(make_confi
 def test_the_health_says_while_ticks_fit_no_packet(make_config: MakeConfig) -> None:
     # GIVEN a companion computer that starts before its clock is set
     config = make_config()
-    onboard = OnboardAgent(config, 1, make_estimator, UNSIGNED, unix_s=1e9, host_s=0.0)
+    onboard = OnboardAgent(config, 1, make_estimator, Identity(), unix_s=1e9, host_s=0.0)
     for step in range(20):
         onboard.advance(0.05 * step)
     health = onboard.core.health.health

@@ -16,10 +16,11 @@ from agent.mavlink.session import LinkState
 from agent.mavlink.signing import MAX_AHEAD_S, STAMP_EPOCH_UNIX_S, LinkSigning, Refusal
 from agent.mavlink.signing_stamps import StampFile
 from agent.onboard import OnboardAgent
+from agent.outputs import Output, ToAutopilot
 from estimators.factory import make_estimator
 from tests.security.conftest import PROFILES
 from transport.errors import KeyFileError
-from transport.security.auth import UNSIGNED
+from transport.security.auth import Identity
 
 KEY, OTHER_KEY = bytes(range(32)), bytes(32)
 NOW_S = 1_800_000_000.0
@@ -192,18 +193,23 @@ class Notes:
         """Not of interest."""
 
 
+def frames_of(outputs: list[Output]) -> list[bytes]:
+    """What goes to the autopilot."""
+    return [frame for output in outputs if isinstance(output, ToAutopilot) for frame in output.frames]
+
+
 @pytest.mark.parametrize("signed", [True, False])
 def test_our_own_frames_sent_back_to_us_are_nobodys_word(signed: bool) -> None:
     """They bear our own good signature, and no stamp of ours is kept among those that came in."""
     # GIVEN an agent whose autopilot asks for the time
     config = load_config(PROFILES / "field.toml")
     signing = LinkSigning(KEY, unix_s=NOW_S) if signed else None
-    onboard = OnboardAgent(config, 1, make_estimator, UNSIGNED, unix_s=NOW_S, host_s=50.0, signing=signing)
+    onboard = OnboardAgent(config, 1, make_estimator, Identity(), unix_s=NOW_S, host_s=50.0, link_signing=signing)
     autopilot = Sender(KEY if signed else None)
     assert onboard.on_mavlink(autopilot.frame(), 50.0)
     assert onboard.on_mavlink(autopilot.time_question(NOW_S + 0.1), 50.1)
     # WHEN somebody sends back what the agent sends: heartbeat, answer, questions
-    sent = onboard.serve_autopilot(50.2)
+    sent = frames_of(onboard.advance(50.2))
     assert len(sent) == 4
     heard = onboard.autopilot.heard
     drew_answers = [onboard.on_mavlink(frame, 50.3) for frame in sent]
@@ -212,7 +218,7 @@ def test_our_own_frames_sent_back_to_us_are_nobodys_word(signed: bool) -> None:
     assert onboard.autopilot.heard == heard
     assert onboard.autopilot.ignored == {"own frame": 4}
     onboard.on_mavlink(autopilot.time_question(NOW_S + 0.4), 50.4)
-    (answer,) = Decoder(datagrams=True).feed(onboard.serve_autopilot(50.5)[0])
+    (answer,) = Decoder(datagrams=True).feed(frames_of(onboard.advance(50.5))[0])
     assert (answer.get_type(), answer.ts1) == ("TIMESYNC", 12345)
 
 
@@ -220,8 +226,9 @@ def test_an_agent_connects_to_its_signing_autopilot_only_and_notes_nothing_forge
     # GIVEN an agent on a signed link
     config = load_config(PROFILES / "field.toml")
     signing, notes = LinkSigning(KEY, unix_s=NOW_S), Notes()
-    onboard = OnboardAgent(config, 1, make_estimator, UNSIGNED, unix_s=NOW_S, host_s=50.0, signing=signing)
-    onboard.journal = notes  # type: ignore[assignment]
+    onboard = OnboardAgent(
+        config, 1, make_estimator, Identity(), unix_s=NOW_S, host_s=50.0, link_signing=signing, journal=notes
+    )
     # WHEN forged and unsigned heartbeats come in
     for stranger in (Sender(None), Sender(OTHER_KEY)):
         assert not onboard.on_mavlink(stranger.frame(), 50.0)  # and none of them draws our answers
@@ -234,5 +241,5 @@ def test_an_agent_connects_to_its_signing_autopilot_only_and_notes_nothing_forge
     assert notes.data == good
     # and what it sends is signed by the wall clock
     autopilot = receiver(unix_s=NOW_S + 1.0)
-    sent = onboard.serve_autopilot(51.0)
+    sent = frames_of(onboard.advance(51.0))
     assert len(autopilot.feed(b"".join(sent))) == len(sent) > 0

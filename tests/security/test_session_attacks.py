@@ -16,7 +16,7 @@ import zenoh
 from nacl.signing import SigningKey
 
 from agent.config.tables import FleetConfig
-from agent.radio.radio import Radio
+from agent.radio.radio import Listener, Radio
 from agent.radio.security import agent_session, driver_session, host_start, observer_session
 from tests.security.conftest import MakeFleet
 from tests.support.ports import bound
@@ -44,10 +44,12 @@ class Target:
     """Agent 1 of a fleet as its daemon holds it: the radio, and the opener behind it."""
 
     def __init__(self, config: FleetConfig, base: Path) -> None:
-        self.radio = Radio(config, 1, base, self._on_packet, self._on_uwb, lambda _: None)
+        self.radio = Radio(config, 1, base, Listener(self._on_packet, self._on_uwb, lambda _: None, self._on_clock))
+        identity = self.radio.identity
+        self.sealer = Sealer(config.fleet.name, 1, boot=identity.boot, signing=identity.signing)
         self.ranged: asyncio.Queue[bytes] = asyncio.Queue()
         fleet, freshness_s = config.fleet.name, config.security.freshness_s
-        self.opener = Opener(fleet, config.ids, self.radio.trust, own_id=1, freshness_s=freshness_s)
+        self.opener = Opener(fleet, config.ids, identity.trust, own_id=1, freshness_s=freshness_s)
         self.heard: asyncio.Queue[int] = asyncio.Queue()
         self.clock_answers: list[ClockAnswer] = []
         self.ticks: list[int] = []
@@ -59,6 +61,10 @@ class Target:
         if received is not None and isinstance(received.message, Measurements):
             self.heard.put_nowait(received.message.tick)
             self.ticks.append(received.message.tick)
+
+    def _on_clock(self, question: bytes, arrived_ns: int) -> bytes:
+        answer = ClockAnswer(decode_clock_question(question), arrived_ns, max(time.time_ns(), arrived_ns))
+        return self.sealer.seal(answer, t_ns=time.time_ns())[0].data
 
     def _on_uwb(self, payload: bytes, _arrived_s: float) -> None:
         self.ranged.put_nowait(payload)
@@ -157,7 +163,7 @@ async def send_until_heard(one: Target, heard: asyncio.Queue[Any]) -> Any:
     """Have agent 1 send until it is heard."""
     end_s = time.monotonic() + BOUND_S
     while time.monotonic() < end_s:
-        one.radio.send(measurements(6))
+        one.radio.send(one.sealer.seal(measurements(6), t_ns=time.time_ns()))
         with contextlib.suppress(TimeoutError):
             return await asyncio.wait_for(heard.get(), 0.2)
     raise AssertionError("agent 1 is not heard")

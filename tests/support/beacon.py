@@ -18,9 +18,10 @@ import numpy as np
 
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
-from agent.radio.radio import Radio
+from agent.radio.radio import Listener, Radio
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.report_body import Diagnostics
+from transport.security.sealing import Sealer
 
 ROOT = Path(__file__).parents[2]
 FIXES = 3.0
@@ -51,13 +52,16 @@ def diagnostics(config: FleetConfig, agent_id: int, *, seconds: int) -> Diagnost
 
 async def _fly(config_file: Path, agent_id: int) -> None:
     config = load_config(config_file)
-    radio = Radio(config, agent_id, config_file.parent, lambda *_: None, lambda *_: None, lambda *_: None)
+    listener = Listener(lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None)
+    radio = Radio(config, agent_id, config_file.parent, listener)
+    sealer = Sealer(config.fleet.name, agent_id, boot=radio.identity.boot, signing=radio.identity.signing)
     await radio.open()
     for count in range(100_000):
         t_s = time.time() - config.fleet.epoch_unix_s  # the common clock: all beacons have everybody at one place
-        radio.send(fleet_estimate(config, t_s, own=agent_id))
+        radio.send(sealer.seal(fleet_estimate(config, t_s, own=agent_id), t_ns=time.time_ns()))
         if count % 10 == 0:
-            radio.send(diagnostics(config, agent_id, seconds=1 + count // 10))
+            said = diagnostics(config, agent_id, seconds=1 + count // 10)
+            radio.send(sealer.seal(said, t_ns=time.time_ns()))
         await asyncio.sleep(config.fleet.period_s)
 
 

@@ -14,6 +14,7 @@ from estimators.estimator import Estimate, Payload, Status
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.settings import EstimatorSettings
+from tests.support.onboard import CONNECTED, onboard_of
 from transport.messages.header import Kind
 from transport.messages.measurement_body import Measurements
 from transport.security.opening import Received
@@ -79,11 +80,11 @@ def lone(make_config: MakeConfig, *overrides: str, count: int = 1) -> tuple[Agen
         return made[-1]
 
     config = make_config(count, "initial.position_m=[0.0, 0.0, 0.0]", *overrides)
-    return AgentCore(config, 1, factory), made
+    return onboard_of(config, factory).core, made
 
 
 def tick_through(core: AgentCore, start_s: float, duration_s: float) -> list[Any]:
     outputs = []
     for step in range(round(duration_s / 0.01)):
-        outputs += core.advance(start_s + 0.01 * step)
+        outputs += core.advance(start_s + 0.01 * step, CONNECTED)
     return outputs

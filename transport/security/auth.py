@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
+from dataclasses import dataclass, field
 
 from nacl.encoding import HexEncoder
 from nacl.exceptions import BadSignatureError
@@ -29,6 +30,19 @@ Signing = SigningKey | Unsigned
 """What an agent signs with."""
 Trust = Mapping[int, tuple[VerifyKey, ...]] | Unsigned
 """Whose signatures are accepted: public keys by agent id, newest first (two while a key is being rotated)."""
+
+
+@dataclass(frozen=True, slots=True)
+class Identity:
+    """Who an agent is on the radio.
+
+    ``signing`` is its own key, ``trust`` whom it believes, ``boot`` the number of this start: greater than at every
+    earlier one (`transport.security.keys.next_boot`).
+    """
+
+    signing: Signing = field(default=UNSIGNED, repr=False)
+    trust: Trust = UNSIGNED
+    boot: int = 1
 
 
 def signed_bytes(key: str, header: bytes, body: bytes) -> bytes:

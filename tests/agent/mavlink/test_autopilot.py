@@ -13,6 +13,7 @@ from agent.config.tables import FleetConfig
 from agent.mavlink.codec import Encoder, mavlink
 from agent.mavlink.session import AutopilotSession, LinkState
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, Sample
+from tests.support.onboard import onboard_of
 
 STEP_S = 0.01
 DELAY_S = 0.001
@@ -29,6 +30,7 @@ class Bench:
     now_s: float = 100.0
     samples: list[Sample] = field(default_factory=list)
     silent: bool = False
+    system_status: int | None = mavlink.MAV_STATE_STANDBY
 
     def run(self, duration_s: float) -> None:
         for _ in range(round(duration_s / STEP_S)):
@@ -36,7 +38,7 @@ class Bench:
             for frame in self.autopilot.step(self.now_s):
                 if not self.silent:
                     self.samples += self.session.receive(frame, self.now_s + DELAY_S)
-            for frame in self.session.to_send(self.now_s + DELAY_S):
+            for frame in self.session.to_send(self.now_s + DELAY_S, self.system_status):
                 self.autopilot.receive(frame, self.now_s + 2 * DELAY_S)
                 for answer in self.autopilot.step(self.now_s + 2 * DELAY_S):
                     if not self.silent:
@@ -48,9 +50,10 @@ class Bench:
 
 @pytest.fixture
 def bench(make_config: Callable[..., FleetConfig], virtual_autopilot: type[Any]) -> Callable[..., Bench]:
-    def make(*overrides: str, **autopilot: Any) -> Bench:
+    def make(*overrides: str, offset_s: float = 0.0, **autopilot: Any) -> Bench:
         config = make_config(3, *overrides)
-        return Bench(AutopilotSession(config, 1, datagrams=True), virtual_autopilot(**autopilot))
+        onboard = onboard_of(config, linked=True, fleet_offset_s=offset_s)
+        return Bench(onboard.autopilot, virtual_autopilot(**autopilot))
 
     return make
 
@@ -72,8 +75,7 @@ def test_an_autopilot_is_found_asked_and_understood(bench: Callable[..., Bench],
 
 
 def test_samples_carry_fleet_time_of_the_boot_stamps(bench: Callable[..., Bench]) -> None:
-    b = bench()
-    b.session.fleet_offset_s = -50.0
+    b = bench(offset_s=-50.0)
     b.run(5)
     last = b.of(ImuSample)[-1]
     assert last.t_s == pytest.approx(b.now_s - 50.0, abs=2e-3)
@@ -86,7 +88,7 @@ def test_our_heartbeat_says_who_and_how_we_are_and_stops_when_at_fault(bench: Ca
     assert len(beats) == 3
     assert (beats[0].get_srcSystem(), beats[0].get_srcComponent()) == (1, 197)
     assert (beats[0].type, beats[0].autopilot) == (18, 8)
-    b.session.system_status = None
+    b.system_status = None
     b.run(3)
     assert len(b.autopilot.received["HEARTBEAT"]) == 3
 

@@ -10,13 +10,12 @@ import numpy as np
 import pytest
 
 from agent.config.tables import FleetConfig, SensorsTable
-from agent.core import AgentCore
 from agent.outputs import EstimateReady
 from agent.sensing.latency import GpsLatency, gps_prior, imu_latency_s
 from agent.sensing.samples import NO_LATENCY, AttitudeSample, GpsSample, ImuSample, LatencyPrior
 from agent.sensing.timeline import TickInput
-from estimators.factory import make_estimator
 from tests.support.manoeuvres import Course
+from tests.support.onboard import CONNECTED, onboard_of
 
 PERIOD_S = 0.1
 GRAVITY_MPS2 = 9.80665
@@ -164,7 +163,7 @@ class Flight:
     course: Course
 
     def __post_init__(self) -> None:
-        self.core = AgentCore(self.config, 1, make_estimator)
+        self.core = onboard_of(self.config).core
         self.errors_m: list[float] = []
         self.latencies: list[tuple[float | None, float | None]] = []
 
@@ -178,7 +177,7 @@ class Flight:
                 self.core.on_attitude(AttitudeSample(now_s, (1.0, 0.0, 0.0, 0.0)), now_s)
             if step % 20 == 4:
                 self.core.on_gps(fix_at(self.course, now_s), now_s)
-            for output in self.core.advance(now_s):
+            for output in self.core.advance(now_s, CONNECTED):
                 if isinstance(output, EstimateReady):
                     error = output.estimate.mean[:2] - self.course.position(output.t_s)
                     self.errors_m.append(float(np.linalg.norm(error)))

@@ -11,10 +11,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from agent.config.tables import SensorsTable
 from agent.sensing.frames import from_euler, rotated
 from agent.sensing.samples import AttitudeSample, ImuSample, Quaternion
 from agent.sensing.timeline import TickInput, Timeline, tick_of
+from tests.agent.conftest import fleet_config
+from tests.support.onboard import onboard_of
 
 GRAVITY = 9.80665
 PERIOD_S = 0.1
@@ -32,7 +33,8 @@ def force(attitude: Quaternion, accel: tuple[float, float, float]) -> tuple[floa
 
 
 def timeline(**sensors: float) -> Timeline:
-    return Timeline(PERIOD_S, GRAVITY, SensorsTable(accel_sigma_mps2=0.1, accel_gap_sigma_mps2=2.0, **sensors))
+    given = {"accel_sigma_mps2": 0.1, "accel_gap_sigma_mps2": 2.0, **sensors}
+    return onboard_of(fleet_config(1, *(f"sensors.{key}={value}" for key, value in given.items()))).core.timeline
 
 
 def fill(made: Timeline, start_s: float, end_s: float, accel: tuple[float, float, float] = (1.0, -2.0, 0.5)) -> None:

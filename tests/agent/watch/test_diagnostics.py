@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import pytest
 
-from agent.config.tables import FleetConfig
-from agent.core import AgentCore
 from agent.watch.diagnostics import diagnostics_of
 from agent.watch.health import assess
 from agent.watch.position_watch import PositionWatch, TickEvidence
-from estimators.factory import make_estimator
 from estimators.integrity.solution import Solution
 from estimators.integrity.staleness import Ages
 from transport.messages.report_body import Diagnostics
@@ -35,15 +31,14 @@ LINK = dict.fromkeys(NAMES, 0.1234567890123)
 
 @pytest.mark.parametrize(("count", "gauges", "told"), [(60, LINK, 60), (200, LINK, 55), (299, {"age_s": 0.5}, 256)])
 def test_the_message_of_a_drone_with_very_many_neighbours_can_be_sent(
-    make_config: Callable[..., FleetConfig], count: int, gauges: dict[str, float], told: int
+    count: int, gauges: dict[str, float], told: int
 ) -> None:
     # GIVEN a daemon with many counters, that hears none of very many neighbours
-    core = AgentCore(make_config(1), 1, make_estimator)
-    core.health.health = SILENT
+    health = SILENT
     counters = {f"something counted, number {i}": 123_456 for i in range(60)}
     neighbours = {str(701 + i): gauges for i in range(count)}
     # WHEN it says how it is
-    message = diagnostics_of(1, core, counters, {"rss_mb": 100.0}, neighbours)
+    message = diagnostics_of(1, health, counters, {"rss_mb": 100.0}, neighbours)
     # THEN the message can be sent, with as many neighbours as it holds, the first ones, and all else
     assert Sealer("test", 1, boot=1, signing=UNSIGNED).seal(message, t_ns=0)
     assert list(message.neighbours) == list(neighbours)[: len(message.neighbours)]
@@ -52,8 +47,7 @@ def test_the_message_of_a_drone_with_very_many_neighbours_can_be_sent(
     assert message.reasons[-1].endswith("... and 291 more")
 
 
-def test_a_reason_that_is_too_long_is_cut(make_config: Callable[..., FleetConfig]) -> None:
-    core = AgentCore(make_config(1), 1, make_estimator)
-    core.health.health = replace(SILENT, reasons=("x" * 500,))
-    message = diagnostics_of(1, core, {}, {}, {})
+def test_a_reason_that_is_too_long_is_cut() -> None:
+    health = replace(SILENT, reasons=("x" * 500,))
+    message = diagnostics_of(1, health, {}, {}, {})
     assert message == Diagnostics(1, "init", ("x" * 128,))

@@ -23,7 +23,7 @@ from sim_bridge import side_process
 from sim_bridge.replay.range_files import RangeCounts
 from sim_bridge.replay.recorded_ranges import ranges_of_record
 from tests.support.logs import LOGS
-from tests.support.onboard_fleet import OnboardFleet
+from tests.support.recorded_fleet import RecordedFleet
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 COPTER, PX4 = LOGS / "copter.tlog.gz", LOGS / "px4.ulg.gz"
@@ -309,7 +309,7 @@ def test_one_range_has_no_spread() -> None:
 def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The records of three daemons after two seconds."""
     folder = tmp_path_factory.mktemp("flown")
-    OnboardFleet(load_config(CONFIGS / "line3.toml"), folder).fly(2.0)
+    RecordedFleet(load_config(CONFIGS / "line3.toml"), folder).fly(2.0)
     return folder
 
 

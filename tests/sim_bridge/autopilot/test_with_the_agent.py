@@ -8,11 +8,12 @@ import numpy as np
 import pytest
 
 from agent.config.reading import config_from
-from agent.mavlink.session import AutopilotSession, LinkState
+from agent.mavlink.session import LinkState
 from agent.sensing.frames import gravity_mps2, rotated
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.simulation import Simulation
+from tests.support.onboard import onboard_of
 
 START_S = 5000.0
 EPOCH_S = 1.7e9
@@ -40,8 +41,7 @@ class Run:
         )
         self.gravity = gravity_mps2(config)
         self.simulation = Simulation(scenario_from_config(config), START_S, EPOCH_S - START_S)
-        self.session = AutopilotSession(config, 1, datagrams=True)
-        self.session.fleet_offset_s = -START_S
+        self.session = onboard_of(config, linked=True, fleet_offset_s=-START_S).autopilot
         self.samples: list[Any] = []
         self.states: dict[int, np.ndarray] = {}
 
@@ -56,7 +56,7 @@ class Run:
             )
             arrival = now + TRANSIT_S
             self._deliver(frames, arrival)
-            for frame in self.session.to_send(arrival):
+            for frame in self.session.to_send(arrival, None):
                 self._deliver(self.simulation.receive(1, frame, arrival + TRANSIT_S), arrival + 2 * TRANSIT_S)
         return self
 

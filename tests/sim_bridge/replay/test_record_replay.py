@@ -21,19 +21,19 @@ from agent.outputs import EstimateReady
 from estimators.factory import make_estimator
 from sim_bridge.replay.record_replay import RecordReplay, ReplayedTick, replay_record
 from sim_bridge.world.scenario import Reboot
-from tests.support.onboard_fleet import ROOM, OnboardFleet, RecordedAgent
+from tests.support.recorded_fleet import ROOM, RecordedFleet
 from transport.link.streams import Stream
 
 LINE3 = Path(__file__).parents[3] / "configs" / "line3.toml"
 DURATION_S = 3.0
 
 
-def record_of(fleet: OnboardFleet, agent_id: int) -> Path:
+def record_of(fleet: RecordedFleet, agent_id: int) -> Path:
     return fleet.out / f"agent_{agent_id:03d}.mcap"
 
 
 def repeat(
-    fleet: OnboardFleet, agent_id: int, config: FleetConfig | None = None
+    fleet: RecordedFleet, agent_id: int, config: FleetConfig | None = None
 ) -> tuple[RecordReplay, list[ReplayedTick]]:
     ticks: list[ReplayedTick] = []
     (result,) = replay_record(
@@ -51,13 +51,13 @@ def same(one: EstimateReady, other: EstimateReady) -> bool:
     )
 
 
-def expect_equal(fleet: OnboardFleet, agent: RecordedAgent, share: slice = slice(None)) -> RecordReplay:
+def expect_equal(fleet: RecordedFleet, agent_id: int, share: slice = slice(None)) -> RecordReplay:
     """The replay gives the live estimates (of a part of the flight) and what is counted."""
-    result, ticks = repeat(fleet, agent.agent_id)
+    result, ticks = repeat(fleet, agent_id)
     made = [tick.ready for tick in ticks if tick.ready is not None]
     assert result.equal
     assert (result.different, result.only_recorded) == (0, 0)
-    live = agent.estimates[share]
+    live = fleet.estimates[agent_id][share]
     assert len(made) == len(live)
     assert all(same(one, other) for one, other in zip(made, live, strict=True))
     return result
@@ -67,42 +67,42 @@ def expect_equal(fleet: OnboardFleet, agent: RecordedAgent, share: slice = slice
 
 
 @pytest.fixture(scope="module")
-def flown(tmp_path_factory: pytest.TempPathFactory) -> OnboardFleet:
-    fleet = OnboardFleet(load_config(LINE3), tmp_path_factory.mktemp("flown"))
+def flown(tmp_path_factory: pytest.TempPathFactory) -> RecordedFleet:
+    fleet = RecordedFleet(load_config(LINE3), tmp_path_factory.mktemp("flown"))
     fleet.fly(DURATION_S)
     return fleet
 
 
-def test_a_flight_repeated_gives_its_estimates_bit_by_bit(flown: OnboardFleet) -> None:
-    for agent in flown.agents.values():
-        result = expect_equal(flown, agent)
+def test_a_flight_repeated_gives_its_estimates_bit_by_bit(flown: RecordedFleet) -> None:
+    for agent_id, drone in flown.drones.items():
+        result = expect_equal(flown, agent_id)
         assert result.ended == CLOSED
         assert result.complete
-        assert result.compared == len(agent.estimates) >= 10 * DURATION_S - 2
-        assert result.counters == dict(agent.onboard.core.counters)
+        assert result.compared == len(flown.estimates[agent_id]) >= 10 * DURATION_S - 2
+        assert result.counters == dict(drone.agent.core.counters)
         assert result.counters["status: ok"] > 5
 
 
-def test_each_estimate_says_which_inputs_it_had(flown: OnboardFleet) -> None:
+def test_each_estimate_says_which_inputs_it_had(flown: RecordedFleet) -> None:
     _, ticks = repeat(flown, 2)
     pairs = [(tick.inputs, tick.recorded.inputs) for tick in ticks if tick.recorded is not None]
     assert all(made == recorded for made, recorded in pairs)
     assert sorted({made for made, _ in pairs}) == [made for made, _ in pairs]
 
 
-def test_another_configuration_says_what_would_have_been(flown: OnboardFleet) -> None:
+def test_another_configuration_says_what_would_have_been(flown: RecordedFleet) -> None:
     # GIVEN a record, WHEN it is repeated with another estimator
     config = flown.config
     other = msgspec.structs.replace(config, estimator=msgspec.structs.replace(config.estimator, kind="dekf_ci"))
     result, ticks = repeat(flown, 1, other)
     # THEN there are as many ticks, with other estimates
-    assert result.ticks == result.compared == len(flown.agents[1].estimates)
+    assert result.ticks == result.compared == len(flown.estimates[1])
     assert result.different > 10
     assert not result.equal
     assert all(tick.ready is not None and np.isfinite(tick.ready.estimate.mean).all() for tick in ticks)
 
 
-def test_a_configuration_without_the_agent_is_refused(flown: OnboardFleet) -> None:
+def test_a_configuration_without_the_agent_is_refused(flown: RecordedFleet) -> None:
     config = msgspec.structs.replace(flown.config, agents=flown.config.agents[:2])
     with pytest.raises(RecordError, match=r"agent_003\.mcap: of agent 3, expected one of 1, 2"):
         repeat(flown, 3, config)
@@ -129,11 +129,11 @@ def spoiler(seed: int) -> Callable[[int, bytes], list[bytes]]:
 
 
 @pytest.fixture(scope="module")
-def rough(tmp_path_factory: pytest.TempPathFactory) -> OnboardFleet:
+def rough(tmp_path_factory: pytest.TempPathFactory) -> RecordedFleet:
     """Signed packets, garbage on all links, forged and repeated packets, a clock that steps, a reboot."""
     config = load_config(LINE3, ["agents.1.mavlink=tcp:127.0.0.1:5760", "security.mode=signed"])
     keys = {i: SigningKey(bytes([i]) * 32) for i in config.ids}
-    fleet = OnboardFleet(
+    fleet = RecordedFleet(
         config,
         tmp_path_factory.mktemp("rough"),
         spoil=spoiler(3),
@@ -146,28 +146,28 @@ def rough(tmp_path_factory: pytest.TempPathFactory) -> OnboardFleet:
 
     def forge() -> None:
         for sender in fleet.config.ids:
-            fleet.transmit(sender, Stream.MEAS, rng.bytes(int(rng.integers(0, 300))))
+            fleet.fleet.transmit(sender, Stream.MEAS, rng.bytes(int(rng.integers(0, 300))))
 
     def step_clock() -> None:
-        fleet.agents[3].utc_error_s = 1.7
+        fleet.drones[3].utc_error_s = 1.7
 
     for k in range(30):
         fleet.queue.at(begin_s + 0.5 + 0.1 * k, forge)
     fleet.queue.at(begin_s + 1.8, step_clock)
-    fleet.queue.at(begin_s + 1.5, lambda: fleet.agents[2].onboard.on_gone(1, fleet.queue.now_s))
+    fleet.queue.at(begin_s + 1.5, lambda: fleet.agent(2).on_gone(1, fleet.queue.now_s))
     fleet.fly(4.0)
     return fleet
 
 
-def test_a_rough_flight_is_repeated_bit_by_bit_too(rough: OnboardFleet) -> None:
-    for agent in rough.agents.values():
-        assert expect_equal(rough, agent).counters == dict(agent.onboard.core.counters)
+def test_a_rough_flight_is_repeated_bit_by_bit_too(rough: RecordedFleet) -> None:
+    for agent_id, drone in rough.drones.items():
+        assert expect_equal(rough, agent_id).counters == dict(drone.agent.core.counters)
 
 
-def test_the_rough_flight_was_rough(rough: OnboardFleet) -> None:
-    first, second, third = (agent.onboard for agent in rough.agents.values())
+def test_the_rough_flight_was_rough(rough: RecordedFleet) -> None:
+    first, second, third = (drone.agent for drone in rough.drones.values())
     assert third.clock.steps == 1
-    assert len(rough.agents[3].estimates) > third.core.counters["ticks"] > 5  # two cores
+    assert len(rough.estimates[3]) > third.core.counters["ticks"] > 5  # two cores
     assert second.autopilot.reboots == 1
     assert first.autopilot.decoder.bad.total() > 3
     assert sum(second.opener.peers.rejections().values()) > 20
@@ -178,43 +178,43 @@ def test_the_rough_flight_was_rough(rough: OnboardFleet) -> None:
 
 def test_a_record_that_ended_at_its_size_repeats_the_flight_until_there(tmp_path: Path) -> None:
     limit = DiskLimit(tmp_path, 50_000, 0, lambda _: ROOM)
-    fleet = OnboardFleet(load_config(LINE3), tmp_path, limit=limit)
+    fleet = RecordedFleet(load_config(LINE3), tmp_path, limit=limit)
     fleet.fly(4.0)
-    for agent in fleet.agents.values():
-        written = agent.record.counters["record entries"]
-        assert 0 < written < agent.record._inputs
-        result, ticks = repeat(fleet, agent.agent_id)
+    for agent_id, record in fleet.records.items():
+        assert record.counters["record entries"] > 0
+        assert record.counters["record dropped"] > 0
+        result, ticks = repeat(fleet, agent_id)
         assert result.equal
         assert not result.complete
         assert "flight_max_mb" in result.ended
-        assert 3 < result.compared < len(agent.estimates)
+        assert 3 < result.compared < len(fleet.estimates[agent_id])
         assert all(
             same(tick.ready, live)
-            for tick, live in zip(ticks, agent.estimates[: len(ticks)], strict=True)
+            for tick, live in zip(ticks, fleet.estimates[agent_id][: len(ticks)], strict=True)
             if tick.ready is not None
         )
 
 
 def test_a_killed_daemons_record_repeats_the_flight_until_the_last_flush(tmp_path: Path) -> None:
     # GIVEN a record that is never closed (what is buffered in the process is lost)
-    fleet = OnboardFleet(load_config(LINE3), tmp_path)
+    fleet = RecordedFleet(load_config(LINE3), tmp_path)
     fleet.fly(2.5, close=False)
     result, _ = repeat(fleet, 2)
     # THEN all but about the last second is there
     assert result.ended.startswith(CUT_OFF)
     assert result.max_mean_difference == result.max_sigma_difference == result.different == 0.0
-    assert result.compared >= len(fleet.agents[2].estimates) - 16
-    for agent in fleet.agents.values():
-        agent.record.close()
+    assert result.compared >= len(fleet.estimates[2]) - 16
+    for record in fleet.records.values():
+        record.close()
 
 
-def test_a_full_disk_leaves_the_flight_as_it_is(tmp_path: Path, flown: OnboardFleet) -> None:
+def test_a_full_disk_leaves_the_flight_as_it_is(tmp_path: Path, flown: RecordedFleet) -> None:
     (tmp_path / "agent_001.tlog").symlink_to("/dev/full")
-    fleet = OnboardFleet(load_config(LINE3), tmp_path)
+    fleet = RecordedFleet(load_config(LINE3), tmp_path)
     fleet.fly(DURATION_S)
     # THEN the agent's flight is the one with a good disk, and only its record is short
-    pairs: Any = zip(fleet.agents[1].estimates, flown.agents[1].estimates, strict=True)
+    pairs: Any = zip(fleet.estimates[1], flown.estimates[1], strict=True)
     assert all(same(one, other) for one, other in pairs)
-    assert "No space left" in fleet.agents[1].record.ended
+    assert "No space left" in fleet.records[1].ended
     assert not repeat(fleet, 1)[0].complete
-    expect_equal(fleet, fleet.agents[2])
+    expect_equal(fleet, 2)

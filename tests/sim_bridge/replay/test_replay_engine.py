@@ -14,6 +14,7 @@ import pytest
 
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Triple
@@ -148,10 +149,11 @@ class Run:
         self.closed = 0
         self.replay = Replay(config, Feed(inputs, self), make_estimator, self.on_estimate)
         self.counts: ReplayCounts = self.replay.run()
-        assert {member.core.last_fault for member in self.replay.members.values()} == {None}
+        counted = {name for drone in self.replay.drones.values() for name in drone.agent.core.counters}
+        assert not {"estimator faults", "core faults"} & counted
 
-    def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
-        self.estimates.setdefault(agent_id, []).append(ready)
+    def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
+        self.estimates.setdefault(agent.agent_id, []).append(ready)
 
     def on_reference(
         self, agent_id: int, sample: TruthSample | AutopilotEstimate | GpsSample, arrival_s: float
@@ -188,7 +190,7 @@ def test_every_drone_knows_its_place_better_than_its_receiver_does(whole: Run) -
     for agent_id in CENTRES:
         assert len(whole.estimates[agent_id]) == pytest.approx(10 * SECONDS, abs=3)
         assert np.sqrt(np.mean(whole.errors_m(agent_id) ** 2)) < 0.1
-        assert whole.counts.members[agent_id]["range: samples"] > 150
+        assert whole.counts.agents[agent_id]["range: samples"] > 150
 
 
 def test_references_come_out_for_the_comparison(whole: Run) -> None:
@@ -203,14 +205,14 @@ def test_twice_is_equal_bit_by_bit(whole: Run) -> None:
         for one, other in zip(estimates, again.estimates[agent_id], strict=True):
             assert one.estimate.mean.tobytes() == other.estimate.mean.tobytes()
             assert one.estimate.covariance.tobytes() == other.estimate.covariance.tobytes()
-    assert again.counts.members == whole.counts.members
+    assert again.counts.agents == whole.counts.agents
 
 
 def test_a_drone_whose_gps_is_dropped_flies_on_by_ranges_and_says_so_in_its_counters() -> None:
     # GIVEN the last 5 s without fixes of drone 2
     run = Run(drops=("2:-5,",))
     # THEN the fixes were counted as left out, the others' were used, and the drone is still located
-    skipped = {i: run.counts.members[i].get("skipped gps: dropped on request", 0) for i in CENTRES}
+    skipped = {i: run.counts.agents[i].get("skipped gps: dropped on request", 0) for i in CENTRES}
     assert skipped == {1: 0, 2: 25, 3: 0}
     assert np.median(run.errors_m(2, SECONDS - 5.0)) < 0.5
     # and without ranges it knows less
@@ -220,11 +222,11 @@ def test_a_drone_whose_gps_is_dropped_flies_on_by_ranges_and_says_so_in_its_coun
 
 def test_loss_and_delay_act_on_the_virtual_radio(whole: Run) -> None:
     lost = Run("transport.loss=1.0", to_s=5.0)
-    assert all(lost.counts.members[i]["packets received"] == 0 for i in CENTRES)
-    assert all(lost.counts.members[i]["injected losses"] > 50 for i in CENTRES)
+    assert all(lost.counts.agents[i]["packets received"] == 0 for i in CENTRES)
+    assert all(lost.counts.agents[i]["injected losses"] > 50 for i in CENTRES)
     late = Run("transport.delay_s=0.2", to_s=5.0)
-    assert late.counts.members[1]["measurements: late"] > 50
-    assert whole.counts.members[1]["measurements: late"] < 10
+    assert late.counts.agents[1]["measurements: late"] > 50
+    assert whole.counts.agents[1]["measurements: late"] < 10
 
 
 def test_ranges_of_a_file_reach_their_observer_and_those_of_others_are_counted() -> None:
@@ -232,9 +234,9 @@ def test_ranges_of_a_file_reach_their_observer_and_those_of_others_are_counted()
     lines = [RangeLine(start_s + 0.1 * k, 1, 2, 15.0, 0.1) for k in range(40)]
     lines += [RangeLine(start_s + 4.0, 9, 1, 15.0, 0.1), RangeLine(start_s + 4.1, 2, 9, 15.0, 0.1)]
     run = Run(ranges=lines, to_s=5.0)
-    assert run.counts.members[1]["range: samples"] == 40
+    assert run.counts.agents[1]["range: samples"] == 40
     assert run.counts.ranges == {"delivered": 41, "observer without a log": 1}
-    assert run.counts.members[2]["skipped uwb not a neighbour"] == 1
+    assert run.counts.agents[2]["skipped uwb not a neighbour"] == 1
 
 
 def test_a_drone_whose_log_ends_is_gone_and_the_others_go_on() -> None:
@@ -255,7 +257,7 @@ def test_a_long_silence_is_left_out_and_the_agents_begin_anew_after_it() -> None
     assert run.counts.leaps == 1
     assert run.counts.left_out_s == pytest.approx(73.0, abs=0.1)
     assert np.count_nonzero((times > 6.0) & (times < 77.0)) < 5
-    assert run.counts.members[1]["ticks: left out"] > 500
+    assert run.counts.agents[1]["ticks: left out"] > 500
     assert np.sqrt(np.mean(run.errors_m(1, 82.0) ** 2)) < 0.2
 
 
@@ -289,13 +291,13 @@ def test_samples_of_other_systems_in_a_log_are_not_taken() -> None:
                 yield event
 
     run = Run(logs=(Mixed(1, seconds=3.0), FlightLog(2, seconds=3.0), FlightLog(3, seconds=3.0)))
-    assert run.counts.members[1]["gps: samples"] == 15
+    assert run.counts.agents[1]["gps: samples"] == 15
 
 
 class Forgetful(Run):
     """Keeps nothing of what comes out."""
 
-    def on_estimate(self, agent_id: int, ready: EstimateReady) -> None:
+    def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
         pass
 
     def on_reference(

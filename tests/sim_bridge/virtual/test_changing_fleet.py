@@ -9,6 +9,7 @@ import pytest
 
 from agent.config.reading import load_config
 from agent.fleet.membership import is_absent
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.algorithms.membership import silence_sigma_m, states_of
 from estimators.estimator import Status
@@ -16,7 +17,7 @@ from estimators.factory import make_estimator
 from estimators.integrity.consistency import nees
 from estimators.model.layout import Layout, block
 from sim_bridge.virtual.fleet_events import FleetEvents, Partition
-from sim_bridge.virtual.fleet_lockstep import Fidelity, FleetLockstep
+from sim_bridge.virtual.fleet_lockstep import Fidelity, FleetLockstep, Surroundings
 from sim_bridge.world.scenario import Interval
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -47,11 +48,13 @@ class Flight:
     ) -> None:
         self.config = load_config(CONFIGS / name, overrides)
         self.estimates: dict[int, list[EstimateReady]] = {agent_id: [] for agent_id in self.config.ids}
-        run = FleetLockstep(
-            self.config, make_estimator, lambda i, ready: self.estimates[i].append(ready), fidelity, events
-        )
+        around = Surroundings(events=events)
+        run = FleetLockstep(self.config, make_estimator, self._on_estimate, fidelity, around)
         self.report = run.run(duration_s)
         self.layout = Layout(self.config.ids)
+
+    def _on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
+        self.estimates[agent.agent_id].append(ready)
 
     def between(self, agent_id: int, from_s: float, to_s: float) -> list[EstimateReady]:
         start_s = self.report.start_unix_s - self.config.fleet.epoch_unix_s

@@ -10,6 +10,7 @@ import pytest
 
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
+from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.estimator import Status
 from estimators.factory import make_estimator
@@ -27,8 +28,11 @@ class Flight:
     def __init__(self, *overrides: str, fidelity: Fidelity = "values", duration_s: float = DURATION_S) -> None:
         self.config: FleetConfig = load_config(LINE3, overrides)
         self.estimates: dict[int, list[EstimateReady]] = {agent_id: [] for agent_id in self.config.ids}
-        run = FleetLockstep(self.config, make_estimator, lambda i, ready: self.estimates[i].append(ready), fidelity)
+        run = FleetLockstep(self.config, make_estimator, self._on_estimate, fidelity)
         self.report: LockstepReport = run.run(duration_s)
+
+    def _on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
+        self.estimates[agent.agent_id].append(ready)
 
     def position_rmse_m(self, agent_id: int) -> float:
         """Of the own position after the transient."""

@@ -29,15 +29,36 @@ class AgentError(Exception):
 class ConfigError(AgentError):
     """A configuration that cannot be used; the message is one line a user can act on.
 
-    ``where`` is the file or override, ``key`` the dotted key, e.g. ``agents[0].mavlink``.
+    ``where`` is the file (``line`` the one in it) or the option that was typed, ``key`` the key in it as people read
+    it, e.g. ``agent 1, mavlink`` (empty: the file as a whole); ``meant`` what was probably meant; ``says`` stands in
+    place of expected and found where they do not fit; ``more`` mistakes were found beside this one.
     """
 
-    def __init__(self, where: str, key: str, expected: str, found: str) -> None:
-        super().__init__(f"{where}: {key}: expected {expected}, found {found}")
-        self.where = where
-        self.key = key
-        self.expected = expected
-        self.found = found
+    def __init__(
+        self,
+        where: str,
+        key: str,
+        expected: str,
+        found: str,
+        *,
+        line: int | None = None,
+        meant: str = "",
+        says: str = "",
+        more: int = 0,
+    ) -> None:
+        self.where, self.line, self.key = where, line, key
+        self.expected, self.found, self.meant, self.says, self.more = expected, found, meant, says, more
+        place = where if line is None else f"{where}:{line}"
+        sentence = says or f"expected {expected}, found {found}{f'; did you mean {meant}?' if meant else ''}"
+        rest = f" (and {more} more: `fleetloc check` shows all)" if more else ""
+        super().__init__(": ".join(part for part in (place, key, sentence) if part) + rest)
+
+    def beside(self, more: int) -> ConfigError:
+        """The same, saying how many mistakes were found beside it."""
+        return ConfigError(
+            self.where, self.key, self.expected, self.found,
+            line=self.line, meant=self.meant, says=self.says, more=more,
+        )  # fmt: skip
 
 
 class EndpointError(AgentError, ValueError):

@@ -40,7 +40,7 @@ def reference() -> str:
         if field.name != "others":
             struct, is_array = _table_of(field.type)
             parts.append(_table(field.name, struct, is_array))
-    parts += [_table(name, struct, False) for name, struct in OTHER_TABLES.items()]
+    parts += [_table(name, table.struct, False) for name, table in OTHER_TABLES.items()]
     return "\n".join(parts)
 
 

@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
-import msgspec
-
-from agent.config.reading import load_config, with_other_table
+from agent.config.documents import Document, Override
+from agent.config.reading import OtherTable, load_config, read, with_other_table
 from agent.config.tables import FleetConfig
-from fleetloc.monitor.monitor_table import MonitorTable, monitor_table
-from sim_bridge.sitl.sitl_table import SitlTable, sitl_table
-from sim_bridge.world.sim_table import SimTable, sim_table
+from agent.errors import ConfigError
+from fleetloc.monitor.monitor_table import MONITOR
+from sim_bridge.sitl.sitl_table import SITL
+from sim_bridge.world.sim_table import SIM
 
-OTHER_TABLES: dict[str, type[msgspec.Struct]] = {"sim": SimTable, "sitl": SitlTable, "monitor": MonitorTable}
-READERS: dict[str, Callable[[FleetConfig], msgspec.Struct]] = {
-    "sim": sim_table,
-    "sitl": sitl_table,
-    "monitor": monitor_table,
-}
+OTHER_TABLES: dict[str, OtherTable[Any]] = {table.name: table for table in (SIM, SITL, MONITOR)}
 
 
-def load_whole(path: str | Path, overrides: Iterable[str] = (), profiles: Iterable[str | Path] = ()) -> FleetConfig:
+def load_whole(
+    path: str | Path, overrides: Iterable[Override] = (), profiles: Iterable[str | Path] = ()
+) -> FleetConfig:
     """`agent.config.reading.load_config` for those who stand for all rooms; a mistake in any table is refused.
 
     Raises `ConfigError`.
@@ -31,6 +29,14 @@ def load_whole(path: str | Path, overrides: Iterable[str] = (), profiles: Iterab
 
 def whole(config: FleetConfig) -> FleetConfig:
     """A configuration with the tables that others than the agent read checked and filled in; raises `ConfigError`."""
-    for name, read in READERS.items():
-        config = with_other_table(config, name, read(config))
+    for name, table in OTHER_TABLES.items():
+        config = with_other_table(config, name, table.of(config))
     return config
+
+
+def read_whole(document: Document) -> tuple[FleetConfig | None, list[ConfigError]]:
+    """The same of a document, with everything that is wrong in any table: then there is no configuration."""
+    config, errors = read(document)
+    for table in OTHER_TABLES.values():
+        errors += table.read(document, config)[1]
+    return (None, errors) if errors or config is None else (whole(config), [])

@@ -14,7 +14,8 @@ import pytest
 import typer
 import yaml
 
-from agent.config.reading import config_from, merged
+from agent.config.documents import merged
+from agent.config.reading import config_from
 from agent.config.tables import FleetConfig, SensorsTable
 from agent.exit_codes import ExitCode
 from agent.uwb.adapter import UwbAdapter

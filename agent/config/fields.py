@@ -12,7 +12,8 @@ NotNegative = Annotated[float, msgspec.Meta(ge=0)]
 Fraction = Annotated[float, msgspec.Meta(ge=0, le=1)]
 Port = Annotated[int, msgspec.Meta(ge=1, le=65_535)]
 Seed = Annotated[int, msgspec.Meta(ge=0)]
-Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,32}$")]
+NAME_RULE = "1 to 32 of the characters a-z, 0-9, - and _"
+Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,32}$", description=NAME_RULE)]
 Point = tuple[float, float, float]
 """NED metres in the fleet frame."""
 

@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
 import msgspec
 
+from agent.config.faults import Fault
 from agent.config.fields import NotNegative, Positive, Table
-from agent.config.reading import other_table
+from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
-from agent.errors import ConfigError
 from transport.link.addresses import is_host
-
-NAME = "monitor"
 
 
 class MonitorTable(Table, frozen=True):
@@ -32,9 +31,14 @@ class MonitorTable(Table, frozen=True):
     """Length of the tracks on the map."""
 
 
+def _faults(table: MonitorTable, _config: FleetConfig) -> Iterator[Fault]:
+    if not is_host(table.host):
+        yield Fault("monitor.host", "an address to listen on", repr(table.host))
+
+
+MONITOR = OtherTable("monitor", MonitorTable, _faults)
+
+
 def monitor_table(config: FleetConfig) -> MonitorTable:
     """The table of a fleet's configuration; raises `ConfigError`."""
-    table = other_table(config, NAME, MonitorTable)
-    if not is_host(table.host):
-        raise ConfigError(config.others.where, "monitor.host", "an address to listen on", repr(table.host))
-    return table
+    return MONITOR.of(config)

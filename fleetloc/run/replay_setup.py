@@ -9,7 +9,8 @@ from pathlib import Path
 
 import msgspec
 
-from agent.config.reading import config_from, read_document
+from agent.config.documents import Override, read_document
+from agent.config.reading import config_of
 from agent.config.tables import FleetConfig
 from agent.log.mcap_record import SUFFIX as RECORD_SUFFIX
 from agent.sensing.frames import FleetFrame
@@ -46,8 +47,8 @@ class Options:
 
     config: Path
     logs: Sequence[Path]
-    settings: Sequence[str] = ()
-    """``key=value`` overrides of the configuration, those of options included."""
+    settings: Sequence[Override] = ()
+    """Overrides of the configuration, those of options included."""
     ranges: Sequence[str] = ()
     """Files, or one word: synthetic, with its settings."""
     truth: Sequence[str] = (AUTO,)
@@ -127,18 +128,19 @@ def prepare(options: Options) -> Prepared:
 def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], str]:
     """The configuration, completed by the origin of the first log where it names none, and the opened logs."""
     document = read_document(options.config)
-    fleet = document.get("fleet")
+    document = document.overridden(options.settings)
+    fleet = document.tables.get("fleet")
     if not isinstance(fleet, dict) or "origin" in fleet:
-        config, origin_from = config_from(document, str(options.config), options.settings), "configuration"
+        config, origin_from = config_of(document), "configuration"
     else:
         # the sensors' settings decide what counts as a first fix: a look at the file with any origin comes first
-        provisional = {**document, "fleet": {**fleet, "origin": {"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0}}}
-        sensors = config_from(provisional, str(options.config), options.settings).sensors
+        anywhere = {"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0}
+        sensors = config_of(document.with_table("fleet", {**fleet, "origin": anywhere})).sensors
         first = open_log(options.logs[0], frame=None, sensors=sensors)
         first.survey()
         frame = first.frame
-        fleet["origin"] = {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m}
-        config = config_from(document, str(options.config), options.settings)
+        origin = {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m}
+        config = config_of(document.with_table("fleet", {**fleet, "origin": origin}))
         origin_from = f"log {options.logs[0].name}"
     frame = FleetFrame.of(config)
     sources = surveyed([open_log(path, frame=frame, sensors=config.sensors) for path in options.logs])

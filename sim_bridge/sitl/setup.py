@@ -39,7 +39,6 @@ class VehicleLinks:
 
 def vehicle_links(config: FleetConfig) -> dict[int, VehicleLinks]:
     """All links by agent; raises `ConfigError` for addresses that are missing, double or of the wrong kind."""
-    _check_vehicles(config)
     _check_height(config)
     links = {agent_id: _links(config, agent_id, number) for number, agent_id in enumerate(config.ids)}
     taken: dict[str, str] = {}
@@ -53,24 +52,6 @@ def vehicle_links(config: FleetConfig) -> dict[int, VehicleLinks]:
                 raise ConfigError(WHERE, what, "an address of its own", f"{address}, that of the {taken[address]}")
             taken[address] = what
     return links
-
-
-def _check_vehicles(config: FleetConfig) -> None:
-    seen: set[int] = set()
-    sitl = sitl_table(config)
-    for index, vehicle in enumerate(sitl.vehicles):
-        key = f"vehicles[{index}].agent"
-        if vehicle.agent not in config.ids:
-            raise ConfigError(WHERE, key, f"ids of agents ({', '.join(map(str, config.ids))})", str(vehicle.agent))
-        if vehicle.agent in seen:
-            raise ConfigError(WHERE, key, "one entry per agent", f"a second one of agent {vehicle.agent}")
-        seen.add(vehicle.agent)
-    last = sitl.client_port + len(config.ids) - 1
-    if last > 65535:
-        raise ConfigError(WHERE, "client_port", "a port for each agent up to 65535", f"{last} for the last")
-    if sitl.component_id == config.mavlink.component_id:
-        found = f"{sitl.component_id} for both"
-        raise ConfigError(WHERE, "component_id", "another id than mavlink.component_id, the daemon's", found)
 
 
 def _check_height(config: FleetConfig) -> None:

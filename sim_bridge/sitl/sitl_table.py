@@ -5,15 +5,17 @@ Noise, rate and seed of the synthesised ranges, the duration and GPS outages are
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated
 
 import msgspec
 
+from agent.config.checks import unknown_ids
+from agent.config.faults import Fault
 from agent.config.fields import AgentId, Positive, Table
-from agent.config.reading import other_table
+from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
-
-NAME = "sitl"
+from transport.link.addresses import MAX_PORT
 
 
 class SitlVehicleTable(Table, frozen=True):
@@ -48,6 +50,25 @@ class SitlTable(Table, frozen=True):
     """File of the mission to fly, relative to the configuration file; absent = the bridge only watches."""
 
 
+def _faults(table: SitlTable, config: FleetConfig) -> Iterator[Fault]:
+    seen: set[int] = set()
+    for index, vehicle in enumerate(table.vehicles):
+        key = f"sitl.vehicles[{index}].agent"
+        yield from unknown_ids(config, key, (vehicle.agent,))
+        if vehicle.agent in seen:
+            yield Fault(key, "one entry per agent", f"a second one of agent {vehicle.agent}")
+        seen.add(vehicle.agent)
+    last = table.client_port + len(config.ids) - 1
+    if last > MAX_PORT:
+        yield Fault("sitl.client_port", f"a port for each agent up to {MAX_PORT}", f"{last} for the last")
+    if table.component_id == config.mavlink.component_id:
+        expected = "another id than mavlink.component_id, the daemon's"
+        yield Fault("sitl.component_id", expected, f"{table.component_id} for both")
+
+
+SITL = OtherTable("sitl", SitlTable, _faults)
+
+
 def sitl_table(config: FleetConfig) -> SitlTable:
     """The table of a fleet's configuration; raises `ConfigError`. `sim_bridge.sitl.setup` checks its addresses."""
-    return other_table(config, NAME, SitlTable)
+    return SITL.of(config)

@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Annotated, Literal
 
 import msgspec
 
+from agent.config.checks import unknown_ids
+from agent.config.faults import Fault
 from agent.config.fields import AgentId, NotNegative, Point, Positive, Seed, Table
-from agent.config.reading import other_table
+from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
-from agent.errors import ConfigError
-
-NAME = "sim"
 
 
 class GpsOutage(Table, frozen=True):
@@ -79,27 +79,24 @@ class SimTable(Table, frozen=True):
     """One per agent."""
 
 
-def sim_table(config: FleetConfig) -> SimTable:
-    """The table of a fleet's configuration, checked against its agents; raises `ConfigError`."""
-    table = other_table(config, NAME, SimTable)
-    _check(table, config)
-    return table
-
-
-def _check(table: SimTable, config: FleetConfig) -> None:
-    where = config.others.where
-    known = f"ids of agents ({', '.join(map(str, config.ids))})"
+def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
     for index, outage in enumerate(table.gps_outages):
         key = f"sim.gps_outages[{index}]"
-        if outage.agent not in config.ids:
-            raise ConfigError(where, f"{key}.agent", known, str(outage.agent))
+        yield from unknown_ids(config, f"{key}.agent", (outage.agent,))
         if outage.to_s <= outage.from_s:
-            raise ConfigError(where, f"{key}.to_s", f"later than from_s = {outage.from_s}", str(outage.to_s))
+            yield Fault(f"{key}.to_s", f"later than from_s = {outage.from_s:g}", f"{outage.to_s:g}")
     flown: set[int] = set()
     for index, path in enumerate(table.paths):
         key = f"sim.paths[{index}].agent"
-        if path.agent not in config.ids:
-            raise ConfigError(where, key, known, str(path.agent))
+        yield from unknown_ids(config, key, (path.agent,))
         if path.agent in flown:
-            raise ConfigError(where, key, "one path per agent", f"a second path of agent {path.agent}")
+            yield Fault(key, "one path per agent", f"a second path of agent {path.agent}")
         flown.add(path.agent)
+
+
+SIM = OtherTable("sim", SimTable, _faults)
+
+
+def sim_table(config: FleetConfig) -> SimTable:
+    """The table of a fleet's configuration, checked against its agents; raises `ConfigError`."""
+    return SIM.of(config)

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from agent.config.reading import config_from, load_config, merged, read_document
+from agent.config.documents import merged, read_document
+from agent.config.reading import config_from, load_config
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
 from agent.radio.radio_faults import FaultsTable, RadioOutage, channel_settings
@@ -95,19 +96,19 @@ def test_of_file_profiles_and_overrides_the_last_one_wins(tmp_path: Path) -> Non
 
 
 def test_laying_over_changes_neither_document() -> None:
-    below, above = read_document(LINE3), {"agents": [{"id": 1, "name": "one"}], "transport": {"link": "udp"}}
+    below, above = read_document(LINE3).tables, {"agents": [{"id": 1, "name": "one"}], "transport": {"link": "udp"}}
     merged(below, above)
-    assert below == read_document(LINE3)
+    assert below == read_document(LINE3).tables
     assert above == {"agents": [{"id": 1, "name": "one"}], "transport": {"link": "udp"}}
 
 
 def test_a_bad_profile_is_named(tmp_path: Path) -> None:
     profile = tmp_path / "typo.toml"
     profile.write_text('[transport]\nlinks = "udp"\n')
-    with pytest.raises(ConfigError, match=r"typo\.toml: transport\.links: expected one of base_port") as caught:
+    with pytest.raises(ConfigError, match=r"typo\.toml:2: transport\.links: expected one of base_port") as caught:
         load_config(LINE3, (), [profile])
     assert "\n" not in str(caught.value)
-    with pytest.raises(ConfigError, match=r"missing\.toml: file: expected a readable TOML file"):
+    with pytest.raises(ConfigError, match=r"missing\.toml: expected a TOML file, found no such file"):
         load_config(LINE3, (), [tmp_path / "missing.toml"])
 
 
@@ -115,9 +116,9 @@ def test_a_bad_profile_is_named(tmp_path: Path) -> None:
     ("overrides", "key"),
     [
         (["transport.link=quic"], "transport.link"),
-        (["transport.link=udp", 'agents.2.listen=["udp/10.0.0.2:7447"]'], "agents[1].radio"),
-        (["transport.faults.outages=[{from_s=2.0, to_s=1.0}]"], "transport.faults.outages[0].to_s"),
-        (["transport.faults.outages=[{from_s=0.0, to_s=1.0, senders=[9]}]"], "transport.faults.outages[0].senders"),
+        (["transport.link=udp", 'agents.2.listen=["udp/10.0.0.2:7447"]'], "agent 2, radio"),
+        (["transport.faults.outages=[{from_s=2.0, to_s=1.0}]"], "transport.faults.outages, entry 1, to_s"),
+        (["transport.faults.outages=[{from_s=0,to_s=1,senders=[9]}]"], "transport.faults.outages, entry 1, senders"),
         (["transport.faults.burst_end=0"], "transport.faults.burst_end"),
     ],
 )
@@ -166,7 +167,7 @@ def test_groups_that_are_left_out_are_everybody() -> None:
 def test_all_faults_reach_the_channel_with_those_of_the_caller() -> None:
     table = {"burst_start": 0.1, "burst_end": 0.5, "burst_loss": 0.9, "delay_uniform_s": 0.01, "in_order": True,
              "reorder": 0.2, "reorder_delay_s": 0.03, "duplicate": 0.04}  # fmt: skip
-    document = read_document(LINE3)
+    document = read_document(LINE3).tables
     document["transport"]["faults"] = table
     faults = config_from(document, "test").transport.faults
     mine = Outage(1.0, 2.0, (3,))

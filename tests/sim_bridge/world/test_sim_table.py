@@ -39,11 +39,11 @@ def test_what_is_put_in_is_what_is_read() -> None:
         ("sim.sed=3", "sim.sed", "one of seed, profile, duration_s", "an unknown key"),
         ("sim=3", "sim", "a table", "3"),
         ("sim.duration_s=nan", "sim.duration_s", "a finite number", "nan"),
-        ("sim.paths.1.kind=loop", "sim.paths[0].kind", "one of waypoints, circle, figure_eight", "'loop'"),
-        ("sim.paths.1.points_m=[]", "sim.paths[0].points_m", "one of kind, agent, center_m", "unknown"),
-        ("sim.paths.1.center_m=[1,2]", "sim.paths[0].center_m", "an array of length 3", "[1, 2]"),
-        ("sim.paths.1.agent=2", "sim.paths[1].agent", "one path per agent", "a second path of agent 2"),
-        ("sim.paths.1.agent=8", "sim.paths[0].agent", "ids of agents", "8"),
+        ("sim.paths.1.kind=loop", "sim.paths of agent 1, kind", "one of waypoints, circle, figure_eight", "'loop'"),
+        ("sim.paths.1.points_m=[]", "sim.paths of agent 1, points_m", "one of kind, agent, center_m", "unknown"),
+        ("sim.paths.1.center_m=[1,2]", "sim.paths of agent 1, center_m", "an array of length 3", "[1, 2]"),
+        ("sim.paths.1.agent=2", "sim.paths, entry 2, agent", "one path per agent", "a second path of agent 2"),
+        ("sim.paths.1.agent=8", "sim.paths of agent 8, agent", "ids of agents", "8"),
     ],
 )
 def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
@@ -56,11 +56,11 @@ def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
     assert expected in caught.value.expected
     assert found in caught.value.found
     assert "\n" not in str(caught.value)
-    assert str(caught.value).startswith(("override: ", str(LINE3)))
+    assert str(caught.value).startswith(("--set: ", str(LINE3)))
 
 
 def test_an_outage_must_end_after_it_begins() -> None:
     document = tomllib.loads(LINE3.read_text())
     document["sim"]["gps_outages"] = [{"agent": 1, "from_s": 5.0, "to_s": 5.0}]
-    with pytest.raises(ConfigError, match=r"sim.gps_outages\[0\].to_s: expected later than from_s = 5.0"):
+    with pytest.raises(ConfigError, match=r"sim.gps_outages of agent 1, to_s: expected later than from_s = 5"):
         sim_table(config_from(document, "here"))

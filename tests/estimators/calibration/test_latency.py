@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_trapezoid
 
@@ -128,15 +128,6 @@ def test_steady_flight_teaches_nothing(velocity_mps: tuple[float, float], white_
     assert made.latency_s == pytest.approx(0.1, abs=0.01)
 
 
-def test_a_receiver_that_wanders_is_not_taken_for_a_late_one() -> None:
-    # GIVEN fixes without latency that wander by a metre within a minute
-    errors = Errors(0.0, white_m=0.1, wander_m=1.0, reported_m=1.0)
-    found = [fly(Course.eight(), errors, (0.0, 0.05), seed=seed) for seed in range(6)]
-    # THEN what is found instead of zero in turns is what the uncertainty allows for
-    assert max(made.sigma_s for made in found) < 0.04
-    assert np.mean([(made.latency_s / made.sigma_s) ** 2 for made in found]) < 2.0
-
-
 def flights(errors: Errors, runs: int) -> np.ndarray:
     """Error and 1-sigma of the latency ``(runs, 2)``; truths are drawn from the prior."""
     rows = []
@@ -146,6 +137,16 @@ def flights(errors: Errors, runs: int) -> np.ndarray:
         made = fly(Course.eight(rng), replace(errors, latency_s=true_s), (0.1, 0.04), 40.0, seed)
         rows.append((made.latency_s - true_s, made.sigma_s))
     return np.array(rows)
+
+
+def test_a_receiver_that_wanders_is_not_taken_for_a_late_one() -> None:
+    # GIVEN fixes that wander by the metre that the receiver claims, with little white noise on it
+    error_s, sigma_s = flights(Errors(white_m=0.1, wander_m=1.0, reported_m=1.0), 40).T
+    # THEN turns teach something, and the error is what the uncertainty allows for. The model takes the white part to
+    # be as large as what is claimed, so it may say up to twice the error, but neither less nor more than that
+    assert np.sqrt(np.mean(error_s**2)) < 0.75 * 0.04
+    assert sigma_s.mean() < 0.75 * 0.04
+    assert 0.25 < np.mean((error_s / sigma_s) ** 2) < 1.84
 
 
 @pytest.mark.parametrize("errors", [AS_MODELLED, REALISTIC], ids=["as modelled", "realistic"])
@@ -260,8 +261,7 @@ def test_integrals_are_those_of_the_smoothed_acceleration(pieces: list[tuple[flo
         history.add(k * TICK_S, (k + 1) * TICK_S, piece, 0.01)
     # GIVEN a span well inside, and the smoothed acceleration on a fine grid
     from_s, to_s = 0.3 + share, len(pieces) * TICK_S - 0.3
-    if to_s <= from_s:
-        return
+    assume(from_s < to_s)
     fine = np.linspace(from_s, to_s, 400)
     inside = np.linspace(-0.25, 0.25, 200, endpoint=False) + 0.00125
     index = np.minimum((fine[:, None] + inside) / TICK_S, len(pieces) - 1).astype(int)

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from estimators.integrity.finding import Finding, Gravity, What
-from estimators.integrity.range_geometry import GeometryMonitor, RangeGeometry
-from estimators.integrity.thresholds import DIRECTIONS, RANGED_TICKS
+from estimators.integrity.range_geometry import GeometryMonitor, RangeGeometry, directions, spread
+from estimators.integrity.thresholds import DIRECTIONS, HELD_SPREAD, RANGED_TICKS
 
 HERE = np.array([1.0, 2.0, -6.0])
 TRIANGLE = np.array([[8.0, 0.0, 0.0], [-6.0, 7.0, 0.0], [-5.0, -8.0, 0.0]])
@@ -57,8 +57,6 @@ def test_what_is_found_depends_on_neither_axes_nor_scale_nor_order(seed: int, sc
     here, places = rng.normal(size=3), rng.normal(size=(4, 3)) * np.array([1.0, 1.0, rng.choice([0.0, 1.0])])
     here[2] *= float(rng.integers(2))
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    smallest = np.linalg.eigvalsh((lambda u: u.T @ u)(RangeGeometry.of(here, places, np.zeros(4)).units))
-    if np.min(np.abs(smallest - 0.03)) < 1e-6:  # rounding decides
-        return
+    assume(np.min(np.abs(spread(directions(here, places)) - HELD_SPREAD)) > 1e-6)  # else rounding decides
     turned = observe(scale * (turn @ here) + 5.0, scale * (places[::-1] @ turn.T) + 5.0)
     assert turned == observe(here, places)

@@ -8,7 +8,6 @@ commands.
 from __future__ import annotations
 
 import importlib
-import importlib.metadata
 import os
 import pkgutil
 import sys
@@ -18,22 +17,15 @@ from typing import Annotated
 
 import typer
 
+import fleetloc
 from fleetloc import commands
 from fleetloc.errors import BAD_INPUT, FAILED, INTERRUPTED, REFUSED
 from fleetloc.shadowing import ROOMS
 
 
-def version() -> str:
-    """Version of the installed package, or ``unknown`` where it runs from sources without installation."""
-    try:
-        return importlib.metadata.version("fleetloc")
-    except importlib.metadata.PackageNotFoundError:
-        return "unknown"
-
-
 def _print_version(wanted: bool) -> None:
     if wanted:
-        typer.echo(f"fleetloc {version()}")
+        typer.echo(f"fleetloc {fleetloc.__version__}")
         raise typer.Exit
 
 

@@ -21,6 +21,7 @@ from agent.exit_codes import ExitCode
 from agent.uwb.adapter import UwbAdapter
 from agent.watch.health import assess
 from estimators.integrity.finding import Finding, Gravity, What
+from fleetloc import UwbFrame, encode_uwb_json
 from fleetloc.cli import build_app
 from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
@@ -204,14 +205,15 @@ def test_the_shown_uwb_driver_makes_frames_that_the_daemon_takes() -> None:
     exec(compile(script, "docs/uwb.md", "exec"), names)
     daemon = UwbAdapter(1, (2, 3), SensorsTable())
 
-    def receive(frame: bytes) -> list[tuple[int, float, float]]:
+    def receive(line: str, seq: int) -> list[tuple[int, float, float]]:
+        frame = encode_uwb_json(UwbFrame(seq, "mono", 49_990_000_000 + seq, (names["range_of"](line),), 1))
         samples = daemon.receive(frame, now_s=100.0, host_s=50.0, unix_s=1.8e9)
         return [(sample.target, sample.range_m, sample.sigma_m) for sample in samples]
 
-    assert receive(names["frame_of"]("2 12.34 0.2", 1, 0, 49_990_000_000)) == [(2, 12.34, 0.2)]
-    assert receive(names["frame_of"]("3 5.5", 1, 1, 49_990_000_000)) == [(3, 5.5, SensorsTable().uwb_sigma_m)]
+    assert receive("2 12.34 0.2", 0) == [(2, 12.34, 0.2)]
+    assert receive("3 5.5", 1) == [(3, 5.5, SensorsTable().uwb_sigma_m)]
     with pytest.raises(ValueError, match="could not convert"):
-        names["frame_of"]("2 far", 1, 2, 0)
+        names["range_of"]("2 far")
 
 
 def test_the_shown_json_frame_is_one() -> None:

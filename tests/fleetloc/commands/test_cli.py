@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 import typer
 
+import fleetloc
 from fleetloc import cli
 from fleetloc.commands import warmup as commands_warmup
 from fleetloc.errors import EnvironmentFault, FleetlocError, InputError
@@ -117,7 +118,7 @@ def test_no_command_shows_the_help(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_version(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["--version"]) == 0
-    assert capsys.readouterr().out == f"fleetloc {cli.version()}\n"
+    assert capsys.readouterr().out == f"fleetloc {fleetloc.__version__}\n"
 
 
 def test_start_imports_nothing_heavy() -> None:

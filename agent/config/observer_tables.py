@@ -6,7 +6,7 @@ from typing import Annotated
 
 import msgspec
 
-from agent.config.fields import NotNegative, Port, Positive, Table
+from agent.config.fields import NotNegative, Port, Table
 
 
 class MetricsTable(Table, frozen=True):
@@ -23,8 +23,6 @@ class LogTable(Table, frozen=True):
 
     directory: str | None = None
     """Folder for ``agent_001.log`` and so on, relative to the working folder; absent = stderr only."""
-    max_mb: Positive = 10.0
-    """A file that has grown to this is put aside as ``.1``, what was ``.1`` as ``.2``."""
     keep: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
     """Files put aside that are kept."""
     min_free_mb: NotNegative = 100.0
@@ -39,5 +37,3 @@ class AdsbTable(Table, frozen=True):
     nothing is sent. Never an autopilot's: it would evade its own fleet."""
     period_s: Annotated[float, msgspec.Meta(ge=0.2, le=10)] = 1.0
     """Each neighbour is sent this often."""
-    max_sigma_m: Positive = 20.0
-    """A neighbour that is known no better than this (largest axis, 1-sigma) is not shown."""

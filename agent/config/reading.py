@@ -7,6 +7,7 @@ raises one `ConfigError` that says where, which key, what was expected and what 
 from __future__ import annotations
 
 import json
+import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path as FilePath
@@ -18,6 +19,7 @@ from agent.config.checks import faults_between
 from agent.config.documents import SET, Document, Override, read_document
 from agent.config.faults import Fault, one_of, probably
 from agent.config.other_tables import READ_BY_OTHERS, OtherTables
+from agent.config.retired import explained, without_retired
 from agent.config.structs import keys_of, read_struct
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
@@ -56,6 +58,21 @@ def config_from(tables: dict[str, Any], where: str, overrides: Iterable[Override
     return config_of(Document(tables, where).overridden(overrides))
 
 
+def recorded_config(text: str, where: str, flown_with: str, overrides: Iterable[Override] = ()) -> FleetConfig:
+    """The configuration in a flight log, where former keys may stand; ``flown_with`` is the software that wrote it.
+
+    Raises `ConfigError`, for a former key with another value than the present constant naming that software.
+    """
+    try:
+        tables, faults = without_retired(tomllib.loads(text))
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(where, "", "valid TOML", str(error)) from error
+    if faults:
+        says = f"{faults[0].says}; replay it with the version that it was flown with ({flown_with})"
+        raise ConfigError(where, faults[0].key, "", "", says=says, more=len(faults) - 1)
+    return config_of(Document(tables, where).overridden(overrides))
+
+
 def config_of(document: Document) -> FleetConfig:
     """The checked configuration that a document describes; raises `ConfigError` for the first thing wrong with it."""
     config, errors = read(document)
@@ -74,7 +91,7 @@ def read(document: Document) -> tuple[FleetConfig | None, list[ConfigError]]:
     if config is not None:
         wrong = {fault.key for fault in faults}
         faults += [fault for fault in faults_between(config) if fault.key not in wrong]
-    return config, [document.error(fault) for fault in faults]
+    return config, [document.error(explained(fault)) for fault in faults]
 
 
 def load_estimator_settings(path: str | FilePath | None, overrides: Iterable[Override] = ()) -> EstimatorSettings:
@@ -118,7 +135,7 @@ class OtherTable(Generic[T]):
         table, faults = read_struct(document.tables.get(self.name, {}), self.struct, self.name)
         if table is not None and config is not None:
             faults = list(self.check(table, config))
-        return table, [document.error(fault) for fault in faults]
+        return table, [document.error(explained(fault)) for fault in faults]
 
 
 def with_other_table(config: FleetConfig, name: str, table: msgspec.Struct) -> FleetConfig:

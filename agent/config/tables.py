@@ -72,10 +72,6 @@ class MavlinkTable(Table, frozen=True):
     imu_hz: Annotated[float, msgspec.Meta(ge=1, le=1000)] = 100.0
     attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
-    local_position_hz: Annotated[float, msgspec.Meta(ge=0, le=50)] = 2.0
-    """For comparison only, never a measurement; 0 = not requested."""
-    timesync_respond: Literal["auto", "on", "off"] = "auto"
-    """auto = answer until another component of the link is seen answering."""
     max_rtt_s: Positive = 0.010
     """TIMESYNC exchanges slower than this (or twice the best) are not used."""
     appear_timeout_s: NotNegative = 60.0
@@ -84,8 +80,6 @@ class MavlinkTable(Table, frozen=True):
     heartbeat_timeout_s: Positive = 3.0
     end_after_lost_s: Positive | None = None
     """An autopilot lost for this long ends the daemon, its records closed: for simulated flights; absent = never."""
-    rate_floor: Fraction = 0.6
-    """A stream below this share of its requested rate is requested again."""
     signing: Literal["auto", "on", "off"] = "auto"
     """Sign frames and refuse those that are not well signed: auto = in the field profiles on all links but serial
     ones; off is refused there unless the link is serial or on loopback."""
@@ -102,11 +96,6 @@ class SensorsTable(Table, frozen=True):
     gps_speed: Literal["horizontal", "norm", "off"] = "horizontal"
     """What GPS_RAW_INT.vel is: ground speed along cog (real receivers), or the velocity's norm (paper)."""
     gps_speed_half_width_mps: Positive | None = None
-    gps_sigma_floor_m: Positive = 0.02
-    gps_speed_sigma_mps: Positive = 0.3
-    """Where the receiver does not report a speed accuracy."""
-    gps_uere_m: Positive = 2.5
-    """sigma = HDOP times this where the receiver reports no accuracy."""
     gps_variance_factor: Annotated[float, msgspec.Meta(ge=1)] = 1.0
     """On the receiver's own position variance. Its error wanders over a minute; a filter that takes ten fixes
     a second for independent soon trusts their mean too much, unless each counts for less."""
@@ -119,16 +108,12 @@ class SensorsTable(Table, frozen=True):
     """Least 1-sigma, whatever the driver claims: what calibration leaves of a pair's bias does not average out."""
     uwb_bound_m: Positive | None = None
     """Hard bound of a range's noise; sets its variance (bound squared over 3) where present."""
-    uwb_max_range_m: Positive = 2000.0
-    uwb_max_age_s: Positive = 1.0
     accel_sigma_mps2: Positive = 0.1
     """1-sigma per axis of the acceleration averaged over a tick."""
     accel_gap_sigma_mps2: Positive = 1.1547
     """1-sigma of the acceleration while no IMU sample came (uniform in +-2 m/s2)."""
     imu_max_gap_s: Positive = 0.05
     """A longer silence between IMU samples counts as a gap."""
-    attitude_max_age_s: Positive = 0.3
-    """An IMU sample without an attitude this close is a gap too."""
     gravity_mps2: Positive | None = None
     """Absent = WGS84 normal gravity at the origin."""
     imu_latency_s: float | None = None
@@ -151,8 +136,6 @@ class InitialTable(Table, frozen=True):
 
     position_m: Point | None = None
     """NED, for all agents; absent = wait for own fixes (or ranges and records of neighbours)."""
-    position_sigma_m: Positive = 50.0
-    """Of agents that nothing was heard of yet; own fixes narrow it by themselves."""
     speed_sigma_mps: Positive = 3.0
     """About the velocity that the first fixes show, or about zero."""
     fixes: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
@@ -207,8 +190,6 @@ class RecordTable(Table, frozen=True):
 
     directory: str | None = None
     """Relative to the working folder; absent = record nothing."""
-    max_mb: Positive = 200.0
-    """Of an agent's estimates; the file stops growing here, the daemon goes on."""
     flight: bool = True
     """Whether to write a flight record beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
     flight_max_mb: Positive = 2000.0

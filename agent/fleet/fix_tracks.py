@@ -16,6 +16,8 @@ from transport.messages.measurement_body import PositionRecord, Record, Velocity
 
 TRACK_FIXES = 20
 ENOUGH_FIXES = 10
+POSITION_SIGMA_M = 50.0
+"""Of a drone that nothing was heard of yet; own fixes narrow it by themselves."""
 SPEED_SIGMA_MPS = 0.15
 """A velocity surer than this needs no more fixes, up to `ENOUGH_FIXES`: a speed is linearised about its direction."""
 VELOCITY_SPREAD = 2.0
@@ -71,7 +73,7 @@ class FixTracks:
 
     def prior(self, position_m: Vector | Triple, velocity_mps: Vector) -> Prior:
         """A wide prior about a place, NED m and m/s: what is known is left to the measurements to say."""
-        sigma = [self._settings.position_sigma_m] * 3 + [self._settings.speed_sigma_mps] * 3
+        sigma = [POSITION_SIGMA_M] * 3 + [self._settings.speed_sigma_mps] * 3
         return np.concatenate((position_m, velocity_mps)), np.diag(np.square(sigma))
 
     def _line(self, lead_s: Vector, places: Matrix, variance: Matrix) -> tuple[Vector, Vector, Vector]:

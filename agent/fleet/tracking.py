@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.fix_tracks import POSITION_SIGMA_M
 from agent.fleet.membership import Roll
 from agent.fleet.record_store import RecordStore
 from estimators.algorithms.dekf_ci import DistributedEkf
@@ -205,7 +206,7 @@ class FleetTracker:
         if self._since_s is None:
             self._since_s = now_s
         if initial.position_m is not None:
-            sigma = [initial.position_sigma_m] * 3 + [initial.speed_sigma_mps] * 3
+            sigma = [POSITION_SIGMA_M] * 3 + [initial.speed_sigma_mps] * 3
             mean = np.array([*initial.position_m, 0.0, 0.0, 0.0])
             return {agent: (mean, np.diag(np.square(sigma))) for agent in self._config.ids}
         found = self.roll.newcomers(tick, tick)
@@ -214,10 +215,10 @@ class FleetTracker:
 
     def _unlocated(self, others: Mapping[int, Prior]) -> Prior:
         """The own block while nothing says where it is: amid the others, as wide as can be."""
-        initial = self._config.initial
+        speed_sigma_mps = self._config.initial.speed_sigma_mps
         mean = np.mean([prior[0] for prior in others.values()], axis=0)
         mean[3:] = 0.0
-        variance = [(2.0 * initial.position_sigma_m) ** 2] * 3 + [initial.speed_sigma_mps**2] * 3
+        variance = [(2.0 * POSITION_SIGMA_M) ** 2] * 3 + [speed_sigma_mps**2] * 3
         return mean, np.diag(variance)
 
     def _change(self, tick: int) -> None:

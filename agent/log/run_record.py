@@ -19,6 +19,8 @@ from agent.watch.observers import DaemonState, Observer
 from transport.security.auth import Trust
 
 MB = 1e6
+ESTIMATES_MB = 200.0
+"""Size at which an agent's estimates stop growing, some 20 minutes of ten drones at 10 Hz; the daemon goes on."""
 SOFTWARE = ("fleetloc", "numpy", "numba")
 """What the last digits of an estimate depend on."""
 
@@ -40,7 +42,7 @@ class RunRecord(Observer):
             period_s=config.fleet.period_s,
             epoch_unix_s=config.fleet.epoch_unix_s,
         )
-        self._estimates = EstimateRecorder(stem.with_suffix(SUFFIX), header, int(settings.max_mb * MB))
+        self._estimates = EstimateRecorder(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
         self.flight: FlightRecord | None = None
         if settings.flight:
             limit = DiskLimit(directory, int(settings.flight_max_mb * MB), int(settings.min_free_mb * MB))

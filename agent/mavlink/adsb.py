@@ -23,6 +23,8 @@ ICAO_BASE = 0xF00000
 EMITTER_UAV = 14
 GEOMETRIC_ALTITUDE = 1
 MAX_AGE_S = 255.0
+MAX_SIGMA_M = 20.0
+"""A neighbour that is known no better than this (largest axis, 1-sigma) is not shown."""
 MIN_HEADING_SPEED_MPS = 0.3
 """Slower, the course over ground is mostly noise and is not given."""
 
@@ -34,7 +36,7 @@ def traffic(
     sigma_m = estimate.covariance.diagonal() ** 0.5
     for slot, other in enumerate(config.ids):
         age_s = float(estimate.age_ticks[slot]) * config.fleet.period_s + since_s
-        known = max(sigma_m[6 * slot : 6 * slot + 3]) <= config.adsb.max_sigma_m
+        known = max(sigma_m[6 * slot : 6 * slot + 3]) <= MAX_SIGMA_M
         if other == agent_id or not known or age_s > MAX_AGE_S:
             continue
         state = tuple(float(value) for value in estimate.mean[6 * slot : 6 * slot + 6])

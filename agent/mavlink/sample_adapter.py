@@ -24,6 +24,12 @@ MAX_STAMP_AGE_S = 5.0
 MAX_STAMP_LEAD_S = 0.2
 UNIX_US = 10**15
 """A ``time_usec`` above this is Unix time (after 2001), below it time since boot."""
+GPS_SIGMA_FLOOR_M = 0.02
+"""Least 1-sigma of a fix, whatever the receiver claims: RTK is no better than its antenna's phase centre."""
+GPS_SPEED_SIGMA_MPS = 0.3
+"""Where the receiver does not report a speed accuracy."""
+GPS_RANGE_ERROR_M = 2.5
+"""1-sigma of a pseudorange (UERE), single frequency: sigma = dilution times this where the receiver reports none."""
 _ACCEL_AND_GYRO = 0b111111
 MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
 """Per axis; beyond what any IMU of a drone can measure (100 g, 5700 deg/s), so no measurement."""
@@ -150,7 +156,7 @@ class SampleAdapter:
             vertical_sigma_m=1.5 * horizontal if vertical is None else vertical,
             ground_velocity_mps=ground,
             speed_mps=norm,
-            speed_sigma_mps=message.vel_acc * 1e-3 or self._sensors.gps_speed_sigma_mps,
+            speed_sigma_mps=message.vel_acc * 1e-3 or GPS_SPEED_SIGMA_MPS,
             fix_type=message.fix_type,
             latency=gps_prior(self.flavour, _stamp_kind(message.time_usec), self._sensors),
         )
@@ -160,12 +166,11 @@ class SampleAdapter:
 
         0 is "unknown": MAVLink 1 and truncated frames carry it.
         """
-        floor = self._sensors.gps_sigma_floor_m
         if accuracy_mm:
-            return max(accuracy_mm * 1e-3, floor)
+            return max(accuracy_mm * 1e-3, GPS_SIGMA_FLOOR_M)
         if dilution_centi in (0, UNKNOWN_16):
             return None
-        return max(max(dilution_centi * 1e-2, 0.5) * self._sensors.gps_uere_m, floor)
+        return max(max(dilution_centi * 1e-2, 0.5) * GPS_RANGE_ERROR_M, GPS_SIGMA_FLOOR_M)
 
     def _speeds(self, message: Message) -> tuple[tuple[float, float] | None, float | None]:
         """Ground velocity or norm of the velocity, whichever ``vel`` is configured to be."""

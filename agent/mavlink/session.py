@@ -31,6 +31,8 @@ _NOT_VEHICLES = {
     mavlink.MAV_TYPE_CAMERA,
     mavlink.MAV_TYPE_ANTENNA_TRACKER,
 }
+LOCAL_POSITION_HZ = 2.0
+"""For comparison only, never a measurement."""
 
 
 class LinkState(StrEnum):
@@ -80,7 +82,7 @@ class AutopilotSession:
         self.samples = SampleAdapter(
             FleetFrame.of(config), config.sensors, config.fleet.epoch_unix_s, self._fleet_time_of_boot
         )
-        self.rates = StreamRates(_wanted(config), config.mavlink.rate_floor)
+        self.rates = StreamRates(_wanted(config))
         self.state = LinkState.SEARCHING
         self.autopilot: AutopilotId | None = None
         self.heard = 0
@@ -196,8 +198,7 @@ class AutopilotSession:
         if message.tc1:
             self.clock.on_reply(message.tc1, message.ts1, now_s)
             return
-        respond = self._settings.timesync_respond
-        if respond == "on" or (respond == "auto" and not self._someone_else_answers):
+        if not self._someone_else_answers:
             answer = mavlink.MAVLink_timesync_message(round(now_s * 1e9), message.ts1)
             self._answers.append(self._encoder.encode(answer))
 
@@ -261,5 +262,5 @@ def _wanted(config: FleetConfig) -> dict[int, float]:
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: settings.attitude_hz,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: settings.gps_hz,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: settings.local_position_hz,
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: LOCAL_POSITION_HZ,
     }

@@ -12,6 +12,8 @@ from agent.mavlink.codec import mavlink
 ACK_TIMEOUT_S = 0.5
 ATTEMPTS = 3
 MEASURE_S = 2.0
+RATE_FLOOR = 0.6
+"""A stream below this share of its wanted rate is asked for again: autopilots round rates to their loop's."""
 REPEAT_S = 30.0
 """Another client may fight for the rates; ask again no more often than this."""
 
@@ -34,8 +36,7 @@ class StreamState:
 class StreamRates:
     """Requests ``(message id, Hz)`` in order, and repeats those that do not come."""
 
-    def __init__(self, wanted: dict[int, float], rate_floor: float) -> None:
-        self._rate_floor = rate_floor
+    def __init__(self, wanted: dict[int, float]) -> None:
         self.streams = {mid: StreamState(mid, hz) for mid, hz in wanted.items() if hz > 0}
         self._open: StreamState | None = None
         self._sent_s = 0.0
@@ -102,7 +103,7 @@ class StreamRates:
         return now_s - stream.settled_s >= REPEAT_S and self._is_slow(stream)
 
     def _is_slow(self, stream: StreamState) -> bool:
-        return stream.rate_hz is not None and stream.rate_hz < self._rate_floor * stream.wanted_hz
+        return stream.rate_hz is not None and stream.rate_hz < RATE_FLOOR * stream.wanted_hz
 
     def _measure(self, now_s: float) -> None:
         for stream in self.streams.values():

@@ -24,6 +24,8 @@ TICK_ROUNDING = 1e-6
 """Instants this share of a tick before a tick's start belong to it: k T is not exact in floating point."""
 KEEP_S = 1.0
 MAX_SAMPLES = 4096
+ATTITUDE_MAX_AGE_S = 0.3
+"""An IMU sample without an attitude this close is a gap: carried further with the turn rate, tilt errors show."""
 _Sample = TypeVar("_Sample", ImuSample, AttitudeSample)
 _time_of = attrgetter("t_s")
 
@@ -99,7 +101,7 @@ class Timeline:
         Between two samples it is interpolated; beside one it is carried there with the turn rate.
         """
         after = bisect_left(self._attitudes, t_s, key=_time_of)
-        limit_s = self._sensors.attitude_max_age_s
+        limit_s = ATTITUDE_MAX_AGE_S
         before = self._attitudes[after - 1] if after > 0 else None
         behind = self._attitudes[after] if after < len(self._attitudes) else None
         if before is not None and behind is not None and behind.t_s - before.t_s <= limit_s:

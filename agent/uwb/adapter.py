@@ -14,6 +14,8 @@ NLOS_SUSPECT_DB = 6.0
 NLOS_SUSPECT_PROBABILITY = 0.5
 NLOS_SIGMA_FACTOR = 3.0
 MAX_LEAD_S = 0.05
+MAX_AGE_S = 1.0
+"""An older frame comes too late for the usual window, 6 ticks of 0.1 s."""
 
 
 class UwbAdapter:
@@ -27,7 +29,7 @@ class UwbAdapter:
         self._observer = observer
         self._others = frozenset(others)
         self._sensors = sensors
-        self.intake = UwbIntake(observer, max_age_s=sensors.uwb_max_age_s)
+        self.intake = UwbIntake(observer, max_age_s=MAX_AGE_S)
         self.skipped: Counter[str] = Counter()
         """Ranges left out, by reason; `intake` counts refused frames."""
 
@@ -53,8 +55,6 @@ class UwbAdapter:
         t_s = measured_s + entry.offset_s
         if entry.other not in self._others:
             return self._skip("not a neighbour")
-        if entry.range_m > self._sensors.uwb_max_range_m:
-            return self._skip("too far")
         if t_s > now_s + MAX_LEAD_S:
             return self._skip("wrong time")
         weakness_db = 0.0

@@ -15,6 +15,8 @@ from agent.log.disk import free_bytes
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
 LINE = "%(asctime)s %(levelname)s %(message)s"
 DISK_CHECK_PERIOD_S = 1.0
+MAX_BYTES = 10_000_000
+"""A file that has grown to this is put aside as ``.1``, what was ``.1`` as ``.2``."""
 
 
 def configure_logging(verbosity: int = 1, file: logging.Handler | None = None) -> None:
@@ -36,7 +38,7 @@ def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_
     path = Path(table.directory) / f"agent_{agent_id:03d}.log"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        limits = round(table.max_mb * 1e6), table.keep, round(table.min_free_mb * 1e6)
+        limits = MAX_BYTES, table.keep, round(table.min_free_mb * 1e6)
         return LimitedLogFile(path, *limits, free)
     except OSError as error:
         raise RecordError(f"log {path}: cannot be written: {error.strerror or error}") from error

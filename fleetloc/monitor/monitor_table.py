@@ -8,7 +8,7 @@ from typing import Annotated
 import msgspec
 
 from agent.config.faults import Fault
-from agent.config.fields import NotNegative, Positive, Table
+from agent.config.fields import NotNegative, Table
 from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
 from transport.link.addresses import is_host
@@ -21,12 +21,6 @@ class MonitorTable(Table, frozen=True):
     """Address of the web page; it has no password."""
     port: Annotated[int, msgspec.Meta(ge=0, le=65_535)] = 8470
     """0 = any free one."""
-    refresh_s: Annotated[float, msgspec.Meta(ge=0.05, le=2)] = 0.2
-    """The picture is renewed this often."""
-    stale_after_s: Positive = 1.0
-    """An estimate older than this (or than three periods) is shown as stale."""
-    lost_after_s: Positive = 2.0
-    """A drone silent for longer than this (or than six periods) is shown as lost; one that left, at once."""
     track_s: NotNegative = 60.0
     """Length of the tracks on the map."""
 

@@ -22,6 +22,10 @@ from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matri
 from transport.messages.report_body import Diagnostics
 
 SIGMAS = 3.0
+STALE_AFTER_S = 1.0
+"""An estimate older than this (or than three periods) is shown as stale."""
+LOST_AFTER_S = 2.0
+"""A drone silent for longer than this (or than six periods) is shown as lost; one that left, at once."""
 TRACK_SPACING_S = 0.2
 MAX_PLACED_SIGMA_M = 1000.0
 """A position known worse than this is none, and is not drawn."""
@@ -67,8 +71,8 @@ class FleetPicture:
         monitor, period_s = monitor_table(config), config.fleet.period_s
         self._config = config
         self._track_s = monitor.track_s
-        self._stale_after_s = max(monitor.stale_after_s, 3 * period_s)
-        self._lost_after_s = max(monitor.lost_after_s, 6 * period_s)
+        self._stale_after_s = max(STALE_AFTER_S, 3 * period_s)
+        self._lost_after_s = max(LOST_AFTER_S, 6 * period_s)
         self._heard = {agent_id: _Heard() for agent_id in config.ids}
         self._links: dict[tuple[int, int], LinkHistory] = {}
         self._since_unix_s: dict[tuple[int, str], float] = {}

@@ -23,6 +23,8 @@ from transport.messages.estimate_body import FleetEstimate
 from transport.messages.report_body import Diagnostics
 from transport.security.opening import Received
 
+REFRESH_S = 0.2
+"""The picture is renewed this often."""
 LINE_PERIOD_S = 10.0
 TERMINAL_PERIOD_S = 0.5
 FIRST_PRINT_S = 1.5
@@ -129,7 +131,7 @@ class Monitor:
             if self._terminal and time.monotonic() >= next_print_s:
                 next_print_s = time.monotonic() + terminal_period_s
                 print_(now)
-            await asyncio.sleep(self._settings.refresh_s)
+            await asyncio.sleep(REFRESH_S)
 
     def _print(self, picture: Picture) -> None:
         for line in table.lines(picture):

@@ -7,6 +7,7 @@ from pathlib import Path
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.log.run_record import ESTIMATES_MB, MB
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.factory import make_estimator
@@ -31,7 +32,7 @@ def fly_in_lockstep(config: FleetConfig, directory: Path) -> Outcome:
                 period_s=fleet.period_s,
                 epoch_unix_s=fleet.epoch_unix_s,
             ),
-            int(config.record.max_mb * 1e6),
+            int(ESTIMATES_MB * MB),
         )
         for agent_id in config.ids
     }

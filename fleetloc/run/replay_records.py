@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import tomllib
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from agent.config.reading import config_from, load_config
+from agent.config.documents import Override
+from agent.config.reading import load_config
+from agent.config.reading import recorded_config as config_in_log
 from agent.config.tables import FleetConfig
 from agent.log.flight_reader import FlightReader
 from agent.log.mcap_record import EstimateMcap
@@ -23,7 +24,7 @@ FIGURES = "report.json"
 
 
 def replay_records(
-    config: Path, records: Sequence[Path], overrides: Sequence[str], folder: Path, json_file: Path | None
+    config: Path, records: Sequence[Path], overrides: Sequence[Override], folder: Path, json_file: Path | None
 ) -> bool:
     """Repeat the runs of flight records and compare every estimate with the recorded one; whether all are equal.
 
@@ -61,13 +62,14 @@ def refuse_mixture(logs: Sequence[Path]) -> None:
         raise InputError("logs", "", "flight records (.mcap) or logs, not both", f"also {', '.join(others)}")
 
 
-def _config(config: Path, record: Path, overrides: Sequence[str]) -> FleetConfig | None:
+def _config(config: Path, record: Path, overrides: Sequence[Override]) -> FleetConfig | None:
     """``None`` for the configuration in the record as it is."""
     if str(config) != RECORDED:
         return load_config(config, overrides)
     if not overrides:
         return None
-    return config_from(tomllib.loads(FlightReader(record).start.config), f"{record}: configuration", overrides)
+    start = FlightReader(record).start
+    return config_in_log(start.config, f"{record}: configuration", start.software, overrides)
 
 
 def _row(result: RecordReplay) -> dict[str, Any]:

@@ -7,7 +7,6 @@ configuration answers what the agent would have estimated with it from what it r
 
 from __future__ import annotations
 
-import tomllib
 from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
@@ -15,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from agent.config.reading import config_from
+from agent.config.reading import recorded_config as config_in_log
 from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
 from agent.errors import AgentError, RecordError
@@ -104,8 +103,8 @@ def replay_record(
 def recorded_config(start: FlightStart, path: Path) -> FleetConfig:
     """The configuration that a record was flown with; raises `RecordError`."""
     try:
-        return config_from(tomllib.loads(start.config), "configuration")
-    except (AgentError, tomllib.TOMLDecodeError) as error:
+        return config_in_log(start.config, "configuration", start.software)
+    except AgentError as error:
         raise RecordError(f"record {path}: its configuration cannot be used: {error}") from error
 
 

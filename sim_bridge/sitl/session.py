@@ -18,7 +18,7 @@ from agent.mavlink.timesync import BootClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Triple
 from sim_bridge.sitl.sitl_table import sitl_table
-from sim_bridge.sitl.truth import TRUTH_MESSAGES, TrueSample, TruthTap, boot_time_s
+from sim_bridge.sitl.truth import TRUTH_HZ, TRUTH_MESSAGES, TrueSample, TruthTap, boot_time_s
 
 HEARTBEAT_S = 1.0
 REBOOT_BACKWARDS_S = 1.0
@@ -42,7 +42,6 @@ class SitlSession:
         self._wanted_flavour = config.agent(agent_id).autopilot
         self._settings = config.mavlink
         sitl = sitl_table(config)
-        self._truth_hz = sitl.truth_hz
         self._encoder = Encoder(self._system, sitl.component_id)
         self.decoder = Decoder(datagrams=datagrams)
         self.tap = TruthTap(FleetFrame.of(config))
@@ -85,7 +84,7 @@ class SitlSession:
         if ts1 is not None:
             messages.append(mavlink.MAVLink_timesync_message(0, ts1))
         if self.tap.needs_simstate:
-            self.rates.add(mavlink.MAVLINK_MSG_ID_SIMSTATE, self._truth_hz)
+            self.rates.add(mavlink.MAVLINK_MSG_ID_SIMSTATE, TRUTH_HZ)
         request = self.rates.poll(now_s)
         if request is not None:
             messages.append(self._interval(*request))
@@ -128,10 +127,10 @@ class SitlSession:
             self.flavour, self._component = flavour, message.get_srcComponent()
             # the attitude's rate is the daemon's, so that the two do not fight; its stamps date the truth
             wanted = {
-                TRUTH_MESSAGES[flavour]: self._truth_hz,
+                TRUTH_MESSAGES[flavour]: TRUTH_HZ,
                 mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._settings.attitude_hz,
             }
-            self.rates = StreamRates(wanted, self._settings.rate_floor)
+            self.rates = StreamRates(wanted)
             self.rates.restart(now_s)
 
     def _on_ack(self, message: Message, now_s: float) -> None:

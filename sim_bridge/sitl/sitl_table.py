@@ -38,8 +38,6 @@ class SitlTable(Table, frozen=True):
     """MAVSDK and ground stations reach agent number n (from 0) at UDP 127.0.0.1, this port + n."""
     component_id: Annotated[int, msgspec.Meta(ge=2, le=255)] = 194
     """MAVLink component id of the bridge; another one than the daemon's."""
-    truth_hz: Annotated[float, msgspec.Meta(ge=5, le=200)] = 50.0
-    """Rate at which the simulators' truth is asked for and recorded."""
     uwb_reach_m: Positive = 200.0
     """No ranges over longer distances."""
     appear_timeout_s: Positive = 60.0

@@ -18,6 +18,8 @@ from agent.sensing.frames import FleetFrame, normalised
 from agent.sensing.samples import Triple
 from sim_bridge.world import geodesy
 
+TRUTH_HZ = 50.0
+"""Rate at which the simulators' truth is asked for and recorded: 0.2 m of flight at 10 m/s apart."""
 MAX_WAITING = 64
 """Truths that no stamped message follows; older ones are given up."""
 STAMPED_IN_US = {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_RAW_IMU}

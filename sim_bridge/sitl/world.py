@@ -16,6 +16,7 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from sim_bridge.sitl.session import TimedTruth
 from sim_bridge.sitl.sitl_table import sitl_table
+from sim_bridge.sitl.truth import TRUTH_HZ
 from sim_bridge.world.guidance import default_path
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
@@ -74,7 +75,6 @@ class SitlWorld:
             scenario_from_config(config), uwb_reach_m=sitl.uwb_reach_m
         )
         self.unix_offset_s = unix_offset_s
-        self.truth_hz = sitl.truth_hz
         self.tracks = {agent_id: VehicleTrack() for agent_id in config.ids}
         self._run: _Run | None = None
         self.stale_s = 0.0
@@ -122,9 +122,9 @@ class SitlWorld:
         tracks = {agent_id: track.samples() for agent_id, track in self.tracks.items()}
         first_s = max(run.start_s, *(float(samples[0, 0]) for samples in tracks.values()))
         last_s = min(end_s, *(float(samples[-1, 0]) for samples in tracks.values()))
-        if last_s - first_s < 2.0 / self.truth_hz:
+        if last_s - first_s < 2.0 / TRUTH_HZ:
             raise TruthError(f"truth: expected more than two samples, found {max(last_s - first_s, 0.0):.3f} s")
-        grid = first_s + np.arange(math.floor((last_s - first_s) * self.truth_hz) + 1) / self.truth_hz
+        grid = first_s + np.arange(math.floor((last_s - first_s) * TRUTH_HZ) + 1) / TRUTH_HZ
         states = [_track_truth(agent_id, samples).at(grid)[:, 0] for agent_id, samples in tracks.items()]
         joint = np.stack(states, axis=1)
         bias_m = run.sensors.pair_bias_m

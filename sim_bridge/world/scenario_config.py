@@ -34,8 +34,6 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         uwb_staggered=sim.profile == "realistic",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
         max_accel_mps2=sim.max_accel_mps2,
-        start_position_half_width_m=sim.start_position_half_width_m,
-        start_speed_half_width_mps=sim.start_speed_half_width_mps,
         gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
     )
 

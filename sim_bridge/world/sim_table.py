@@ -71,9 +71,6 @@ class SimTable(Table, frozen=True):
     uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
     max_accel_mps2: Positive = 2.0
     """Commanded acceleration is clipped to this per axis."""
-    start_position_half_width_m: NotNegative = 15.0
-    """Starts are drawn uniformly from a cube about each path's start."""
-    start_speed_half_width_mps: NotNegative = 2.0
     gps_outages: tuple[GpsOutage, ...] = ()
     paths: tuple[PathTable, ...] = ()
     """One per agent."""

@@ -6,7 +6,13 @@ import math
 from dataclasses import dataclass
 
 from agent.config.tables import SensorsTable
-from agent.mavlink.sample_adapter import MAX_FORCE_MPS2, MAX_TURN_RADPS
+from agent.mavlink.sample_adapter import (
+    GPS_RANGE_ERROR_M,
+    GPS_SIGMA_FLOOR_M,
+    GPS_SPEED_SIGMA_MPS,
+    MAX_FORCE_MPS2,
+    MAX_TURN_RADPS,
+)
 from agent.sensing.frames import FleetFrame
 from agent.sensing.latency import gps_prior, imu_latency_s
 from agent.sensing.samples import GpsSample, ImuSample, Triple
@@ -46,8 +52,8 @@ def gps_sample(fix: Fix, frame: FleetFrame, flavour: str, sensors: SensorsTable)
     height_m = frame.height(fix.alt_msl_m, fix.alt_ellipsoid_m)
     if height_m is None or not math.isfinite(height_m):
         return "gps: no height of the fleet's sort"
-    horizontal_m = _sigma_m(fix.horizontal_sigma_m, fix.hdop, sensors)
-    vertical_m = _sigma_m(fix.vertical_sigma_m, fix.vdop, sensors)
+    horizontal_m = _sigma_m(fix.horizontal_sigma_m, fix.hdop)
+    vertical_m = _sigma_m(fix.vertical_sigma_m, fix.vdop)
     if horizontal_m is None:
         return "gps: no accuracy"
     ground, norm = _speeds(fix, sensors)
@@ -58,7 +64,7 @@ def gps_sample(fix: Fix, frame: FleetFrame, flavour: str, sensors: SensorsTable)
         vertical_sigma_m=1.5 * horizontal_m if vertical_m is None else vertical_m,
         ground_velocity_mps=ground,
         speed_mps=norm,
-        speed_sigma_mps=_known(fix.speed_sigma_mps) or sensors.gps_speed_sigma_mps,
+        speed_sigma_mps=_known(fix.speed_sigma_mps) or GPS_SPEED_SIGMA_MPS,
         fix_type=fix.fix_type,
         latency=gps_prior(flavour, "boot", sensors),
     )
@@ -78,13 +84,13 @@ def _known(value: float | None) -> float | None:
     return value if value is not None and math.isfinite(value) and value > 0.0 else None
 
 
-def _sigma_m(accuracy_m: float | None, dilution: float | None, sensors: SensorsTable) -> float | None:
+def _sigma_m(accuracy_m: float | None, dilution: float | None) -> float | None:
     """1-sigma in m: the receiver's own, else from the dilution of precision."""
     own, diluted = _known(accuracy_m), _known(dilution)
     if own is None and diluted is None:
         return None
-    sigma_m = own if own is not None else max(diluted or 0.0, LEAST_HDOP) * sensors.gps_uere_m
-    return max(sigma_m, sensors.gps_sigma_floor_m)
+    sigma_m = own if own is not None else max(diluted or 0.0, LEAST_HDOP) * GPS_RANGE_ERROR_M
+    return max(sigma_m, GPS_SIGMA_FLOOR_M)
 
 
 def _speeds(fix: Fix, sensors: SensorsTable) -> tuple[tuple[float, float] | None, float | None]:

@@ -31,6 +31,16 @@ def test_ned_to_geodetic_and_back(ned_m: tuple[float, float, float], geoid: floa
     assert frame.ned(*frame.geodetic(ned_m)) == pytest.approx(ned_m, abs=1e-5)
 
 
+def test_a_receiver_that_sends_the_other_height_only_needs_the_geoid_separation(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    """GIVEN heights above sea level WHEN only the ellipsoidal one comes THEN the configured separation is between."""
+    without, given = FleetFrame.of(make_config(1)), FleetFrame.of(make_config(1, "sensors.geoid_separation_m=47.5"))
+    assert without.height(None, 535.5) is None
+    assert given.height(None, 535.5) == pytest.approx(488.0)
+    assert given.height(490.0, 535.5) == 490.0
+
+
 def test_a_hundred_metres_north_east_and_up() -> None:
     frame = FleetFrame(0.0, 0.0, 0.0, msl=False)
     # One second of arc of the equator and of the meridian there (WGS84: 30.922 m and 30.715 m).

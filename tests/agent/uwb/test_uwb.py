@@ -51,13 +51,12 @@ def test_without_a_clock_arrival_counts_and_offsets_and_latency_apply() -> None:
     ("entry", "reason"),
     [
         (UwbRange(9, 5.0), "not a neighbour"),
-        (UwbRange(2, 150.0), "too far"),
         (UwbRange(2, 5.0, offset_s=0.5), "wrong time"),
         (UwbRange(2, 5.0, rx_dbm=-78.0, first_path_dbm=-90.0), "no line of sight"),
     ],
 )
 def test_a_range_that_cannot_be_used_is_counted_and_the_others_stand(entry: UwbRange, reason: str) -> None:
-    made = adapter(uwb_max_range_m=100.0)
+    made = adapter()
     samples = receive(made, encode_uwb_json(frame(entry, UwbRange(3, 7.0))))
     assert [sample.target for sample in samples] == [3]
     assert dict(made.skipped) == {reason: 1}

@@ -1,0 +1,69 @@
+"""Keys that are no longer keys: what each is now, and the old files that still have them.
+
+Nobody set them, so each is a constant beside the code that uses it. A fleet's file that has one is refused with what
+took its place. Old flight logs hold the whole configuration that they were flown with, these keys too: there they are
+left out where they have the constant's value, and else the log needs the version that it was flown with.
+"""
+
+from __future__ import annotations
+
+import copy
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+from agent.config.faults import Fault
+
+
+@dataclass(frozen=True, slots=True)
+class Retired:
+    """A former key: the value that it has for good, and how that is said."""
+
+    value: object
+    words: str
+
+
+RETIRED: Mapping[str, Retired] = {
+    "sensors.gps_sigma_floor_m": Retired(0.02, "it is 2 cm"),
+    "sensors.gps_speed_sigma_mps": Retired(0.3, "it is 0.3 m/s"),
+    "sensors.gps_uere_m": Retired(2.5, "it is 2.5 m"),
+    "sensors.uwb_max_age_s": Retired(1.0, "it is 1 s"),
+    "sensors.uwb_max_range_m": Retired(2000.0, "a frame with a range over 2000 m is refused"),
+    "sensors.attitude_max_age_s": Retired(0.3, "it is 0.3 s"),
+    "initial.position_sigma_m": Retired(50.0, "it is 50 m"),
+    "mavlink.local_position_hz": Retired(2.0, "it is 2 Hz"),
+    "mavlink.timesync_respond": Retired("auto", "the daemon answers until another component is seen answering"),
+    "mavlink.rate_floor": Retired(0.6, "it is 0.6"),
+    "record.max_mb": Retired(200.0, "it is 200 MB"),
+    "log.max_mb": Retired(10.0, "it is 10 MB"),
+    "adsb.max_sigma_m": Retired(20.0, "it is 20 m"),
+    "sim.start_position_half_width_m": Retired(15.0, "it is 15 m"),
+    "sim.start_speed_half_width_mps": Retired(2.0, "it is 2 m/s"),
+    "sitl.truth_hz": Retired(50.0, "it is 50 Hz"),
+    "monitor.refresh_s": Retired(0.2, "it is 0.2 s"),
+    "monitor.stale_after_s": Retired(1.0, "it is 1 s, or three periods"),
+    "monitor.lost_after_s": Retired(2.0, "it is 2 s, or six periods"),
+}
+
+
+def explained(fault: Fault) -> Fault:
+    """A fault of an unknown key, saying what took its place if it was a key once."""
+    retired = RETIRED.get(re.sub(r"\[\d+\]", "", fault.key))
+    if retired is None:
+        return fault
+    return replace(fault, meant="", says=f"no longer a key: {retired.words}; remove the line")
+
+
+def without_retired(tables: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """Tables of an old file without the former keys, and those of them whose value can be had no longer."""
+    kept, faults = copy.deepcopy(tables), []
+    for key, retired in RETIRED.items():
+        table, _, name = key.partition(".")
+        inside = kept.get(table)
+        if not isinstance(inside, dict) or name not in inside:
+            continue
+        value = inside.pop(name)
+        if value != retired.value:
+            faults.append(Fault(key, "", "", says=f"{value} was set, and it is no longer a key: {retired.words}"))
+    return kept, faults

@@ -82,6 +82,7 @@ def _row(result: RecordReplay) -> dict[str, Any]:
         "compared": result.compared,
         "only_recorded": result.only_recorded,
         "different_in_a_bit": result.different,
+        "different_status_or_age": result.contradicted,
         "max_mean_difference": result.max_mean_difference,
         "max_sigma_difference": result.max_sigma_difference,
         "equal": result.equal,

@@ -68,7 +68,9 @@ class RecordReplay:
     only_recorded: int = 0
     """Recorded estimates that were not made again."""
     different: int = 0
-    """Compared estimates that differ in any bit of mean or sigma, or in their status."""
+    """Compared estimates that differ in any bit of mean or sigma, or are contradicted."""
+    contradicted: int = 0
+    """Compared estimates whose status, agents or ages differ: no rounding does that."""
     max_mean_difference: float = 0.0
     max_sigma_difference: float = 0.0
     counters: dict[str, int] = field(default_factory=dict)
@@ -81,9 +83,10 @@ class RecordReplay:
 
     @property
     def equal(self) -> bool:
-        """Whether every recorded estimate was made again to within rounding."""
+        """Whether every recorded estimate was made again: its status and ages, mean and sigma to within rounding."""
         difference = max(self.max_mean_difference, self.max_sigma_difference)
-        return self.compared > 0 and not self.only_recorded and difference <= TOLERANCE
+        complete = self.compared > 0 and not self.only_recorded
+        return complete and not self.contradicted and difference <= TOLERANCE
 
 
 def replay_record(
@@ -190,9 +193,15 @@ class _Pairing:
             (mean, sigma), (was_mean, was_sigma) = again.arrays(), recorded.arrays()
             result.max_mean_difference = max(result.max_mean_difference, float(np.abs(mean - was_mean).max()))
             result.max_sigma_difference = max(result.max_sigma_difference, float(np.abs(sigma - was_sigma).max()))
+        result.contradicted += _told(again) != _told(recorded)
         result.different += (again.agents, again.status) != (recorded.agents, recorded.status)
         self._give_out(replace(made, recorded=recorded))
 
     def _give_out(self, tick: ReplayedTick) -> None:
         if self._on_tick is not None:
             self._on_tick(self._result.agent_id, tick)
+
+
+def _told(message: EstimateMessage) -> tuple[int, dict[str, float | None]]:
+    """What an estimate says beside its numbers: its status, and the age of the data behind each agent."""
+    return message.status, {agent: seen.age_s for agent, seen in message.agents.items()}

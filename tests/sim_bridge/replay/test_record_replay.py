@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+import shutil
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
@@ -10,6 +12,9 @@ from typing import Any
 import msgspec
 import numpy as np
 import pytest
+from mcap.records import Channel, DataEnd, Message, Metadata, Schema
+from mcap.stream_reader import StreamReader
+from mcap.writer import Writer
 from nacl.signing import SigningKey
 
 from agent.config.reading import load_config
@@ -18,6 +23,7 @@ from agent.errors import RecordError
 from agent.log.disk import DiskLimit
 from agent.log.flight_format import CLOSED, CUT_OFF
 from agent.outputs import EstimateReady
+from estimators.estimator import Status
 from estimators.factory import make_estimator
 from sim_bridge.replay.record_replay import RecordReplay, ReplayedTick, replay_record
 from sim_bridge.world.scenario import Reboot
@@ -100,6 +106,85 @@ def test_another_configuration_says_what_would_have_been(flown: RecordedFleet) -
     assert result.different > 10
     assert not result.equal
     assert all(tick.ready is not None and np.isfinite(tick.ready.estimate.mean).all() for tick in ticks)
+
+
+def retold(path: Path, folder: Path, change: Callable[[dict[str, Any]], None]) -> Path:
+    """A copy of a flight log in which the twentieth estimate says something else."""
+    copy, seen = folder / path.name, 0
+    shutil.copy(path.with_suffix(".tlog"), folder)
+    with path.open("rb") as stream, copy.open("wb") as out:
+        writer = Writer(out)
+        writer.start()
+        topics: dict[int, str] = {}
+        for record in StreamReader(stream).records:
+            if isinstance(record, DataEnd):
+                break  # the index behind it is made anew
+            if isinstance(record, Metadata):
+                writer.add_metadata(record.name, record.metadata)
+            elif isinstance(record, Schema):
+                writer.register_schema(record.name, record.encoding, record.data)
+            elif isinstance(record, Channel) and record.id not in topics:
+                topics[record.id] = record.topic
+                assert writer.register_channel(record.topic, record.message_encoding, record.schema_id) == record.id
+            elif isinstance(record, Message):
+                data = record.data
+                if topics[record.channel_id].endswith("/estimate"):
+                    seen += 1
+                    if seen == 20:
+                        said = json.loads(data)
+                        change(said)
+                        data = json.dumps(said).encode()
+                writer.add_message(record.channel_id, record.log_time, data, record.publish_time, record.sequence)
+        writer.finish()
+    return copy
+
+
+def other_status(said: dict[str, Any]) -> None:
+    said["status"] = int(Status.FELL_BACK)
+
+
+def other_age(said: dict[str, Any]) -> None:
+    said["agents"]["agent_002"]["age_s"] += 0.1
+
+
+def no_age(said: dict[str, Any]) -> None:
+    del said["agents"]["agent_003"]["age_s"]
+
+
+def other_mean(said: dict[str, Any]) -> None:
+    said["agents"]["agent_002"]["position_m"]["north"] += 1e-6
+
+
+def rounded_mean(said: dict[str, Any]) -> None:
+    said["agents"]["agent_002"]["position_m"]["north"] += 1e-10
+
+
+@pytest.mark.parametrize(
+    ("change", "contradicted", "different", "equal"),
+    [
+        (lambda said: None, 0, 0, True),
+        (rounded_mean, 0, 1, True),
+        (other_mean, 0, 1, False),
+        (other_status, 1, 1, False),
+        (other_age, 1, 1, False),
+        (no_age, 1, 1, False),
+    ],
+    ids=["same", "rounded mean", "other mean", "other status", "other age", "no age"],
+)
+def test_a_run_is_equal_only_if_status_and_ages_are_too(
+    flown: RecordedFleet,
+    tmp_path: Path,
+    change: Callable[[dict[str, Any]], None],
+    contradicted: int,
+    different: int,
+    equal: bool,
+) -> None:
+    # GIVEN a flight log one of whose estimates says something else in a single place
+    path = retold(record_of(flown, 1), tmp_path, change)
+    (result,) = replay_record([path], None, make_estimator)
+    # THEN only rounding passes for equal
+    assert result.complete
+    assert (result.contradicted, result.different, result.equal) == (contradicted, different, equal)
 
 
 def test_a_configuration_without_the_agent_is_refused(flown: RecordedFleet) -> None:

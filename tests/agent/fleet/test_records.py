@@ -12,12 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.config.tables import FleetConfig, SensorsTable
-from agent.fleet.record_store import RecordStore
+from agent.fleet.record_store import KEEP_TICKS, RecordStore
 from agent.fleet.records import acceleration_record, gps_records, inputs_of, range_record, rows_of
 from agent.sensing.samples import GpsSample, RangeSample
 from agent.sensing.timeline import TickInput
 from estimators.model import measurements
 from estimators.model.measurements import Kind
+from tests.support.holding import held
 from transport.messages.measurement_body import (
     AccelerationRecord,
     AnchorRangeRecord,
@@ -249,8 +250,9 @@ def test_memory_stays_bounded(make_config: Callable[..., FleetConfig]) -> None:
         store.add_heard([RangeRecord(2, tick, 3, 4.0, 0.1)], tick)
         store.add_heard([VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
         store.take(tick, IDS, IDS)
-    assert len(store._seen) <= 66
-    assert len(store._to_send) <= 66
+    kept = held(store)
+    for kind in (PositionRecord, RangeRecord, VelocityRecord):
+        assert kept[kind] <= KEEP_TICKS + 2
 
 
 def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_the_members(

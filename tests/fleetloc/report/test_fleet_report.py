@@ -102,6 +102,7 @@ def test_errors_are_those_of_the_truth_at_the_tick(figures: dict[str, Any]) -> N
         assert agent["anees"] == pytest.approx(3 * 0.25 / SIGMA_M**2 / 18)
         assert agent["tick_time_p50_s"] == pytest.approx(0.002)
     assert figures["fleet"]["position_rmse_m"] == pytest.approx(0.5)
+    assert figures["fleet"]["times_real_time"] == pytest.approx(SECONDS / 21.0)
 
 
 def test_counters_of_all_lives_are_added(figures: dict[str, Any]) -> None:
@@ -166,4 +167,4 @@ def test_lockstep_from_the_command_line_repeats(tmp_path: Path, capsys: pytest.C
     assert (report["mode"], report["seed"], report["config"]["transport"]["loss"]) == ("lockstep", 5, 0.2)
     assert all(agent["tick_time_p50_s"] is None for agent in report["agents"])
     assert all(agent["ticks_on_time"] == agent["ticks_expected"] == 30 for agent in report["agents"])
-    assert report["fleet"]["times_real_time"] > 1.0
+    assert report["fleet"]["times_real_time"] == pytest.approx(report["duration_s"] / report["fleet"]["wall_s"])

@@ -19,6 +19,7 @@ def test_every_hostile_datagram_has_to_leave_a_trace() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_daemon_refuses_and_counts_whatever_a_stranger_sends(tmp_path: Path) -> None:
     # GIVEN a live fleet with signed packets, WHEN a peer without a key fuzzes the one in the middle
     result = fuzz(tmp_path, PACKETS, DATAGRAMS, DURATION_S, seed=7)

@@ -8,28 +8,31 @@ import signal
 import subprocess
 import sys
 from collections.abc import Callable
-from datetime import datetime, timedelta
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from agent.config.reading import load_config
+from agent.config.tables import FleetConfig
 from agent.log.estimate_log import read_record
-from fleetloc.report.fleet_report import report_figures
 from fleetloc.report.fleet_results import load_results
 from fleetloc.run.lockstep_run import fly_in_lockstep
+from sim_bridge.world.truth import load_truth
 from tests.support.fleet_process import ROOT, FleetProcess, until
+from tests.support.machine import Witness, check_on_time, witnessed
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 Start = Callable[..., FleetProcess]
-DROPPED_WITHIN = timedelta(seconds=2)
-BACK_WITHIN_S = 10.0
+DROPPED_WITHIN_S, BACK_WITHIN_S = 2.0, 10.0
+SETTLED_S = 10.0
 
 
 def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fleet: Start, tmp_path: Path) -> None:
-    fleet = start_fleet("--duration", "20", "--seed", "1", "--json", str(tmp_path / "figures.json"))
-    code, stdout, stderr = fleet.finish()
+    with witnessed(tmp_path) as witness:
+        fleet = start_fleet("--duration", "20", "--seed", "1", "--json", str(tmp_path / "figures.json"))
+        code, stdout, stderr = fleet.finish()
     assert code == 0, stderr
     assert str(fleet.out / "report.html") in stdout
     assert fleet.nothing_left()
@@ -38,31 +41,49 @@ def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fl
     assert report["duration_s"] == pytest.approx(20.0, abs=0.1)
     assert report["seed"] == 1
     assert report["fleet"]["deaths"] == []
-    # GIVEN a machine that may be busy with other things, THEN still nearly every tick is on time
-    assert report["fleet"]["ticks_on_time_fraction"] >= 0.95
-    again = lockstep_position_rmse_m(fleet.out / "fleet.toml", tmp_path / "again")
     for agent in report["agents"]:
         assert agent["ticks_expected"] == pytest.approx(200, abs=1)
-        assert agent["position_rmse_after_10s_m"] == pytest.approx(again[agent["id"]], rel=0.15)
         assert 0.3 < agent["anees_after_10s"] < 3.0
-        assert 0.0 < agent["tick_time_p50_s"] <= agent["tick_time_p99_s"] < 0.1
-        assert 0.0 < agent["cpu_fraction"] < 1.0
-        assert 50.0 < agent["rss_mb"] < 400.0
+        assert 0.0 < agent["tick_time_p50_s"] <= agent["tick_time_p99_s"]
+        assert agent["cpu_fraction"] > 0.0
+        assert agent["rss_mb"] > 0.0
         assert agent["packets"]["received"] > 300
         assert agent["packets"]["rejected"] == {}
         assert agent["sensors"]["imu"]["used"] > 1500
         assert agent["sensors"]["gps"]["used"] > 150
         assert agent["sensors"]["range"]["used"] > 150
     check_page((fleet.out / "report.html").read_text())
+    config = load_config(fleet.out / "fleet.toml")
+    check_on_time(load_results(config, fleet.out), Witness(witness))
+    again = tmp_path / "again"
+    again.mkdir()
+    fly_in_lockstep(config, again)
+    check_accuracy(config, fleet.out, again)
 
 
-def lockstep_position_rmse_m(config_file: Path, directory: Path) -> dict[int, float]:
-    """Own position RMSE after 10 s of the same scenario in virtual time, by agent."""
-    config = load_config(config_file)
-    directory.mkdir()
-    outcome = fly_in_lockstep(config, directory)
-    figures = report_figures(config, load_results(config, directory), directory, outcome, "lockstep")
-    return {agent["id"]: agent["position_rmse_after_10s_m"] for agent in figures["agents"]}
+def check_accuracy(config: FleetConfig, live: Path, lockstep: Path) -> None:
+    """An agent that had in time what it has in virtual time is as good; on a busy machine some packets are late."""
+    for agent_id in config.ids:
+        (age, error_m), (usual, expected_m) = (settled(config, folder, agent_id) for folder in (live, lockstep))
+        (ages,), counts = np.unique(usual, axis=0, return_counts=True)
+        assert counts.sum() >= 90
+        informed = (age == ages).all(axis=1)
+        window = config.estimator.window
+        settled_again = np.convolve(informed, np.ones(window), "valid") == window
+        assert settled_again.sum() >= 40
+        rmse_m = np.sqrt(np.mean(error_m[window - 1 :][settled_again] ** 2))
+        assert rmse_m == pytest.approx(np.sqrt(np.mean(expected_m**2)), rel=0.15)
+
+
+def settled(config: FleetConfig, folder: Path, agent_id: int) -> tuple[np.ndarray, np.ndarray]:
+    """From `SETTLED_S` on, by tick: ages ``(K, n)`` of the data, own position errors ``(K,)`` in m."""
+    header, entries = read_record(folder / f"agent_{agent_id:03d}.estimates")
+    truth, slot = load_truth(folder / "truth.npz"), config.ids.index(agent_id)
+    unix_s = entries["t_s"] + header.epoch_unix_s
+    inside = (unix_s >= truth.time_unix_s[0] + SETTLED_S) & (unix_s < truth.time_unix_s[-1])
+    place_m = entries["mean"][inside].reshape(-1, len(config.ids), 6)[:, slot, :3]
+    error_m = np.linalg.norm(place_m - truth.at(unix_s[inside])[:, slot, :3], axis=1)
+    return entries["age_ticks"][inside], error_m
 
 
 def check_page(page: str) -> None:
@@ -72,13 +93,14 @@ def check_page(page: str) -> None:
     assert "url(http" not in page
 
 
-def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start) -> None:
+def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path: Path) -> None:
     fleet = start_fleet("--duration", "14")
     until(fleet.flying, "flight")
     until(lambda: "agent 2: ok" in fleet.log(2), "agent 2 is aligned")
-    pid, killed_at = fleet.pid_of(3), datetime.now()
-    os.kill(pid, signal.SIGKILL)
-    until(lambda: "neighbour 3 has left" in fleet.log(2), "agent 2 notices")
+    with witnessed(tmp_path) as witness:
+        pid, killed_at = fleet.pid_of(3), datetime.now()
+        os.kill(pid, signal.SIGKILL)
+        until(lambda: "neighbour 3 has left" in fleet.log(2), "agent 2 notices")
     restarted = subprocess.Popen(
         [sys.executable, "-m", "fleetloc", "agent", str(fleet.out / "fleet.toml"), "--id", "3"],
         cwd=ROOT, stderr=subprocess.DEVNULL,
@@ -90,7 +112,9 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start) -> None:
         restarted.wait()
     assert code == 0, stderr
     assert "agent 3 killed by SIGKILL" in stderr
-    assert time_of(fleet.log(2), "neighbour 3 has left") - killed_at < DROPPED_WITHIN
+    dropped_s = time_of(fleet.log(2), "neighbour 3 has left").timestamp() - killed_at.timestamp()
+    late_s = Witness(witness).lost_s(killed_at.timestamp(), killed_at.timestamp() + dropped_s)
+    assert 0.0 < dropped_s < DROPPED_WITHIN_S + late_s
     report = fleet.report()
     assert [death["name"] for death in report["fleet"]["deaths"]] == ["agent 3"]
     killed = report["agents"][2]

@@ -28,7 +28,11 @@ WARM_S, COLD_S = 8.0, 15.0
 """A cold link comes up when all four datagrams of a handshake get through: every fourth try, two tries in 3 s."""
 MEETING_S = 2.0
 
-pytestmark = [pytest.mark.slow, pytest.mark.skipif(why_not() is not None, reason=str(why_not()))]
+pytestmark = [
+    pytest.mark.slow,
+    pytest.mark.realtime,
+    pytest.mark.skipif(why_not() is not None, reason=str(why_not())),
+]
 
 
 def fly(out: Path, *, cold: bool, duration_s: float) -> tuple[dict[str, Any], Delivery, int]:

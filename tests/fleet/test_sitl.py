@@ -113,6 +113,7 @@ def sitl(tmp_path: Path) -> Iterator[Sitl]:
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_fleet_of_both_flavours_flies_a_mission_and_knows_where_it_is(sitl: Sitl) -> None:
     pytest.importorskip("mavsdk", reason="the MAVSDK client is not installed: no mission can be flown")
     sitl.start_simulators()

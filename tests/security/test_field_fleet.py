@@ -19,6 +19,7 @@ AGREE_M = 1.0
 
 
 @pytest.mark.slow
+@pytest.mark.realtime
 def test_a_field_fleet_of_three_flies_and_agrees(tmp_path: Path) -> None:
     # GIVEN the field profile as it is shipped, on free ports, with keys made by the command
     file = tmp_path / "field.toml"

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.model.gaussian import Prior
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 
@@ -96,9 +97,20 @@ class Estimator(Protocol):
     A tick is ``begin``, then for each consensus round l = 0..rounds-1 ``outgoing(l)`` and ``mix(l, ...)``,
     then ``solve``. Ticks grow by one. Rows and inputs may belong to earlier ticks (late arrivals): they go
     to their place in the window; older ones are counted in ``dropped`` and ignored.
+    Between two ticks the fleet may change: ``change_members``.
     """
 
     layout: Layout
+
+    @property
+    def fixed_members(self) -> bool:
+        """Whether it is for fixed fleets only: then ``change_members`` raises ``RuntimeError``."""
+        ...
+
+    @property
+    def prior_tick(self) -> int:
+        """The tick that the prior of a joining agent has to speak of; between two ticks, after the first."""
+        ...
 
     @property
     def rounds(self) -> int:
@@ -126,7 +138,13 @@ class Estimator(Protocol):
         """The estimate of the tick, with at most ``budget`` iterations where the method iterates."""
         ...
 
+    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+        """Let agents join and leave, between two ticks (after ``solve``, before ``begin``).
 
-def symmetrised(matrix: NDArray[Any]) -> Matrix:
-    """The symmetric part of a square matrix."""
-    return np.asarray(0.5 * (matrix + matrix.T), np.float64)
+        ``agents`` are the ids of the new fleet in the order of their blocks, ``own`` among them. Those in ``fresh``
+        begin with a prior at ``prior_tick``, uncorrelated with the rest, also if they were there before; all others
+        keep their block. Rows that name a removed or replaced agent are dropped. Raises ``KeyError`` for an agent
+        that is neither old nor fresh, and ``numpy.linalg.LinAlgError`` where the old information is singular; then
+        the estimator is of no use any more.
+        """
+        ...

@@ -25,10 +25,10 @@ def make_estimator(
         from estimators.algorithms.moving_horizon import MovingHorizonEstimator
 
         return MovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
-    if settings.kind == "dmhe_relay":
-        from estimators.algorithms.relay_mhe import RelayMovingHorizonEstimator
+    if settings.kind == "dmhe_shared":
+        from estimators.algorithms.shared_mhe import SharedMovingHorizonEstimator
 
-        return RelayMovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
+        return SharedMovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
     if settings.kind == "dekf_ci":
         from estimators.algorithms.dekf_ci import DistributedEkf
 

@@ -8,14 +8,16 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf"]
+Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf"]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
-DEFAULT_KIND: Kind = "dmhe_relay"
+DEFAULT_KIND: Kind = "dmhe_shared"
 """What runs where nothing is said; docs/algorithms.md says why."""
+FORMER_KINDS: Mapping[str, Kind] = {"dmhe_relay": "dmhe_shared"}
+"""Former names of kinds, by which configurations and stored flights may still call them."""
 DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
-    "dmhe_relay": {
+    "dmhe_shared": {
         "window": 6,  # ticks that a late or repeated record may take
         "rounds": 2,  # a record moves as many hops in a tick
         "share_inputs": "fleet",
@@ -95,11 +97,18 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
     """Convergence: largest change of a state component, m or m/s, still expected from another iteration."""
 
 
+def present_name(kind: str) -> str:
+    """What a kind of estimator is called today."""
+    return FORMER_KINDS.get(kind, kind)
+
+
 def with_kind_defaults(table: Mapping[str, Any]) -> dict[str, Any]:
     """An ``[estimator]`` table as it was written, completed by its kind and that kind's own defaults."""
     kind = table.get("kind", DEFAULT_KIND)
-    own = DEFAULTS_OF_KIND.get(kind, {}) if isinstance(kind, str) else {}
-    return {"kind": kind, **own, **table}
+    if not isinstance(kind, str):
+        return dict(table)
+    kind = present_name(kind)
+    return {**DEFAULTS_OF_KIND.get(kind, {}), **table, "kind": kind}
 
 
 def default_settings() -> EstimatorSettings:

@@ -149,6 +149,50 @@ def test_import_check_allows_the_table(name: str, source: str) -> None:
     assert list(import_faults(name, source)) == []
 
 
+def foreign_assignments(name: str, source: str) -> Iterator[str]:
+    """Assignments to a private attribute, or into one, of another object than ``self`` or ``cls``."""
+    for node in ast.walk(ast.parse(source)):
+        if not isinstance(node, ast.Attribute | ast.Subscript) or not isinstance(node.ctx, ast.Store | ast.Del):
+            continue
+        target: ast.expr = node
+        while isinstance(target, ast.Subscript):
+            target = target.value
+        if not isinstance(target, ast.Attribute) or not target.attr.startswith("_") or target.attr.startswith("__"):
+            continue
+        owner = target.value
+        if not (isinstance(owner, ast.Name) and owner.id in ("self", "cls")):
+            yield f"{name}:{node.lineno} sets {ast.unparse(target)}"
+
+
+def test_nobody_sets_private_state_of_another_object() -> None:
+    faults = [fault for path in modules() for fault in foreign_assignments(dotted(path), path.read_text())]
+    assert not faults, "\n".join(faults)
+
+
+@pytest.mark.parametrize(
+    "source",
+    [
+        "other._x = 1",
+        "other._x += 1",
+        "other._x: int = 1",
+        "other._x[0] = 1",
+        "self.part._x = 1",
+        "a, other._x = 1, 2",
+        "del other._x",
+        "for other._x in range(2): pass",
+    ],
+)
+def test_private_state_check_finds_faults(source: str) -> None:
+    assert len(list(foreign_assignments("agent.a", source))) == 1
+
+
+@pytest.mark.parametrize(
+    "source", ["self._x = 1", "cls._x[0] = 1", "other.x = 1", "y = other._x", "self.__x = 1", "_x = 1"]
+)
+def test_private_state_check_allows_the_rest(source: str) -> None:
+    assert list(foreign_assignments("agent.a", source)) == []
+
+
 def crowded_folders(paths: list[Path]) -> dict[str, int]:
     """Folders with more modules than a reader can survey."""
     count = Counter(str(path.parent.relative_to(ROOT)) for path in paths if path.name != "__init__.py")

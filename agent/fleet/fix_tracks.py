@@ -9,8 +9,8 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from agent.fleet.motions import Motions
 from agent.sensing.samples import Triple
-from estimators.algorithms.membership import Prior
 from estimators.integrity.thresholds import FIX_MEMORY_TICKS
+from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from transport.messages.measurement_body import PositionRecord, Record, VelocityRecord
 

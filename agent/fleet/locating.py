@@ -13,10 +13,10 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.motions import MEMORY_TICKS, Motions
-from estimators.algorithms.membership import Prior
 from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
 from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
+from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
 from transport.messages.measurement_body import RangeRecord, Record

@@ -19,13 +19,14 @@ from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import FixTracks
 from agent.fleet.locating import RangeLocator
 from agent.fleet.motions import Motions
-from estimators.algorithms.membership import Prior, marginal_pair, silence_sigma_m
 from estimators.estimator import Estimate
 from estimators.integrity.finding import Finding
 from estimators.integrity.range_geometry import GeometryMonitor, RangeGeometry
 from estimators.integrity.thresholds import HELD_SIGMA_M, RANGED_TICKS, TOLD_SIGMA_M
+from estimators.model.gaussian import Prior, marginal_pair
 from estimators.model.layout import STATES_PER_AGENT, block, position
 from estimators.model.measurements import Vector
+from estimators.model.unknown_motion import silence_sigma_m
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import AccelerationRecord, RangeRecord, Record

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from agent.config.tables import FleetConfig
-from estimators.algorithms.membership import unseen_variance
 from estimators.model.measurements import Matrix, Vector
+from estimators.model.unknown_motion import unseen_variance
 from transport.messages.measurement_body import AccelerationRecord, Record
 
 MEMORY_TICKS = 60

@@ -17,19 +17,12 @@ from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import POSITION_SIGMA_M
 from agent.fleet.membership import Roll
 from agent.fleet.record_store import RecordStore
-from estimators.algorithms.dekf_ci import DistributedEkf
-from estimators.algorithms.membership import (
-    Prior,
-    mapped_payload,
-    prior_tick,
-    states_of,
-    unseen_variance,
-    with_members,
-)
-from estimators.algorithms.moving_horizon import MovingHorizonEstimator
+from estimators.consensus.mapping import mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
-from estimators.model.layout import STATES_PER_AGENT, Layout, block
+from estimators.model.gaussian import Prior
+from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
 from estimators.model.measurements import InputTable, Matrix, Vector, empty_inputs, input_rows
+from estimators.model.unknown_motion import unseen_variance
 from estimators.settings import EstimatorSettings
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
@@ -223,20 +216,17 @@ class FleetTracker:
 
     def _change(self, tick: int) -> None:
         """Take in who has been located since the last tick, let go who is gone."""
-        estimator = self._estimator
-        if not isinstance(estimator, MovingHorizonEstimator | DistributedEkf):
-            return  # a yardstick of fixed fleets
-        fresh = self.roll.newcomers(tick, prior_tick(estimator))
+        assert self._estimator is not None
+        if self._estimator.fixed_members:
+            return
+        fresh = self.roll.newcomers(tick, self._estimator.prior_tick)
         gone = self.roll.gone(tick)
         if not fresh and not gone:
             return
         self._counters["drones joined"] += len(fresh)
         self._counters["drones gone"] += len(gone)
         self.roll.enter(fresh, gone, tick)
-        if isinstance(estimator, DistributedEkf):
-            self._estimator = with_members(estimator, self.roll.members, self._agent_id, fresh)
-        else:
-            self._estimator = with_members(estimator, self.roll.members, self._agent_id, fresh)
+        self._estimator.change_members(self.roll.members, self._agent_id, fresh)
 
     def _unseen_manoeuvres(self, tick: int) -> InputTable:
         """Accelerations, unknown, of drones silent for so long that none will come any more.

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from estimators.estimator import Estimate, Payload, Status, symmetrised
+from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.observability import row_jacobian
+from estimators.model.gaussian import Prior, symmetrised
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix
@@ -47,6 +48,7 @@ class CentralizedEkf:
     """
 
     rounds = 0
+    fixed_members = True
 
     def __init__(
         self,
@@ -77,6 +79,11 @@ class CentralizedEkf:
     def dropped(self) -> int:
         """Rows and inputs that came after their tick."""
         return self.window.dropped
+
+    @property
+    def prior_tick(self) -> int:
+        """The last tick."""
+        return self.window.last
 
     def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
         """Predict to the tick and update with its rows."""
@@ -112,3 +119,7 @@ class CentralizedEkf:
             Status.OK if self._had_rows else Status.NO_DATA,
             self.window.ages(),
         )
+
+    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+        """A yardstick of fixed fleets."""
+        raise RuntimeError("the fleet of a centralised filter is fixed")

@@ -7,46 +7,23 @@ rows there, and one prediction later an arbitrary one.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from estimators.compiled.entries import entry, kernel
+from estimators.compiled.entries import entry
 from estimators.compiled.linear_algebra import cholesky_solve, factor_upper, inverse_from_cholesky
-from estimators.consensus.information import fuse, usable_pairs
-from estimators.estimator import Estimate, Payload, Status, symmetrised
+from estimators.consensus.fusion import Fusion
+from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.observability import observability_rank
-from estimators.model.layout import STATES_PER_AGENT, Layout
+from estimators.model.corrections import add_corrections
+from estimators.model.gaussian import Prior, symmetrised
+from estimators.model.layout import Layout
 from estimators.model.measurements import ROW, InputTable, Matrix, RowTable, Vector, empty_rows
+from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import predict_information, predict_mean, predict_state
-from estimators.model.row_kernels import (
-    PRECISION,
-    VALUE,
-    add_curvature,
-    add_gradient,
-    dot_gradient,
-    encode_rows,
-    predict_row,
-)
 from estimators.settings import EstimatorSettings
 from estimators.window.history import MeasurementWindow
-
-
-@kernel
-def add_corrections(
-    rows: RowTable, predicted: Vector, eps: float, information: Matrix, vector: Vector
-) -> None:
-    """Add rows to an information pair, linearised at ``predicted``: C'R^-1 C and C'R^-1 (y - h + C x)."""
-    m = rows.shape[0]
-    code = np.empty((m, 3), np.int64)
-    data = np.empty((m, 7))
-    unit = np.empty(4)
-    encode_rows(rows, np.arange(predicted.shape[0] // STATES_PER_AGENT), code, data)
-    for r in range(m):
-        innovation = data[r, VALUE] - predict_row(code, data, r, predicted, eps, unit)
-        pseudo = innovation + dot_gradient(code, data, r, unit, predicted)
-        add_gradient(code, data, r, unit, data[r, PRECISION] * pseudo, vector)
-        add_curvature(code, data, r, unit, data[r, PRECISION], 0.0, information)
 
 
 @entry(
@@ -101,6 +78,8 @@ class DistributedEkf:
     sets the horizon of the observability rank, evaluated at the prediction, as in the frozen cases.
     """
 
+    fixed_members = False
+
     def __init__(
         self,
         settings: EstimatorSettings,
@@ -122,23 +101,28 @@ class DistributedEkf:
             other_accel_variance=settings.other_accel_variance,
             reciprocal_ranges=settings.reciprocal_ranges,
         )
-        self._mean = np.array(prior_mean, float)
-        self._information = symmetrised(np.linalg.inv(prior_covariance))
-        self._pair: tuple[Matrix, Vector] = (self._information, self._information @ self._mean)
+        self.state = InformationState.from_moments(prior_mean, prior_covariance)
+        """Filtered belief about the last tick."""
+        self._consensus = Fusion(settings.weights)
         self._healthy = True
         self._motion: tuple[Vector, Vector] | None = None
         """Acceleration and its variance over the tick that ends now; None at the first."""
         self._rows = empty_rows()
-        self._rank = 0
-        self._ranks: dict[int, int] = {}
-        self._degree = 0
-        self.refused_pairs = 0
-        """Neighbours' pairs of the right tick that could not be fused."""
 
     @property
     def dropped(self) -> int:
         """Rows and inputs that came after their tick."""
         return self.window.dropped
+
+    @property
+    def refused_pairs(self) -> int:
+        """Neighbours' pairs of the right tick that could not be fused."""
+        return self._consensus.refused
+
+    @property
+    def prior_tick(self) -> int:
+        """The last tick."""
+        return self.window.last
 
     def begin(self, tick: int, measurements: RowTable, inputs: InputTable) -> None:
         """Predict to the tick and correct with its regional rows."""
@@ -149,7 +133,7 @@ class DistributedEkf:
         accel, variance = self.window.inputs()
         self._motion = None if first else (accel[-1], variance[-1])
         unknown = np.zeros(3 * self.layout.size)
-        predicted, information = self._mean.copy(), self._information.copy()
+        predicted, information = self.state.mean.copy(), self.state.information.copy()
         vector = np.empty_like(predicted)
         self._healthy = predict_and_correct(
             rows,
@@ -162,10 +146,8 @@ class DistributedEkf:
             information,
             vector,
         )
-        self._pair = (information, vector)
         self._rows = rows
-        self._rank = self._observability_rank(predicted)
-        self._ranks = {}
+        self._consensus.begin(tick, (information, vector), self._observability_rank(predicted))
 
     def _observability_rank(self, predicted: Vector) -> int:
         """Rank over the coming ticks if nothing but the clock moved: x, A x, A^2 x, ... with today's rows."""
@@ -179,39 +161,45 @@ class DistributedEkf:
 
     def outgoing(self, round_: int) -> Payload:
         """The corrected pair after ``round_`` rounds."""
-        return Payload(self.window.last, *self._pair, self._rank, self._degree)
+        return self._consensus.outgoing()
 
     def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         """One round of consensus on information. Pairs of another tick are not used."""
-        usable, refused = usable_pairs(received, self.window.last, self.layout.dimension)
-        self.refused_pairs += refused
-        if round_ == 0:
-            self._ranks = {slot: pair.rank for slot, pair in usable.items()}
-            self._degree = len(usable)
-        for slot in usable:
+        for slot in self._consensus.mix(round_, received):
             self.window.hear(slot, self.window.last)
-        self._pair = fuse(self.outgoing(round_), usable, self.settings.weights, self._ranks)
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Mean and covariance of the fused pair; ``budget`` is not used, nothing iterates."""
-        mean, covariance = np.empty_like(self._mean), np.empty_like(self._information)
-        healthy = self._healthy and recover(*self._pair, mean, covariance)
+        fused = self._consensus.outgoing()
+        mean, covariance = np.empty_like(fused.vector), np.empty_like(fused.information)
+        healthy = self._healthy and recover(fused.information, fused.vector, mean, covariance)
         if not healthy or not np.isfinite(mean).all() or not np.isfinite(covariance).all():
             return self._keep_last()
-        self._mean, self._information = mean.copy(), self._pair[0]
+        self.state = InformationState(mean.copy(), fused.information)
         status = Status.OK if len(self._rows) else Status.NO_DATA
         return Estimate(self.window.last, mean, symmetrised(covariance), status, self.window.ages())
 
     def _keep_last(self) -> Estimate:
         """The last good estimate carried to this tick, flagged, where the new one cannot be formed."""
         if self._motion is not None:
-            mean, information, vector = self._mean.copy(), self._information.copy(), np.empty_like(self._mean)
-            eps = self.settings.norm_smoothing_m
+            mean, information = self.state.mean.copy(), self.state.information.copy()
+            vector, eps = np.empty_like(mean), self.settings.norm_smoothing_m
             if predict_and_correct(
                 empty_rows(), *self._motion, self.period_s, eps, True, mean, information, vector
             ):
-                self._mean, self._information = mean, information
-        covariance = symmetrised(np.linalg.inv(self._information))
+                self.state = InformationState(mean, information)
         return Estimate(
-            self.window.last, self._mean.copy(), covariance, Status.FELL_BACK, self.window.ages()
+            self.window.last,
+            self.state.mean.copy(),
+            self.state.covariance(),
+            Status.FELL_BACK,
+            self.window.ages(),
         )
+
+    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+        """Let agents join and leave, see `estimators.estimator.Estimator`."""
+        change = MemberChange.between(self.layout, agents, own, fresh)
+        self.state = self.state.reindexed(change)
+        self.layout, self.slot = change.after, change.own
+        self.window.change_members(change)
+        self._consensus.change_members()

@@ -27,6 +27,10 @@ class Pairs(NamedTuple):
     """``(J, 6n)``."""
 
 
+NO_PAIRS = Pairs(np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
+"""Nothing to fuse."""
+
+
 @kernel
 def combine(
     weights: Vector, informations: NDArray[np.float64], vectors: Matrix, information: Matrix, vector: Vector

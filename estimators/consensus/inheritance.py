@@ -12,7 +12,7 @@ The own marginal on S is untouched, and no datum enters it a second time.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from math import isnan
 
 import numpy as np
@@ -21,12 +21,59 @@ from numpy.typing import NDArray
 from estimators.compiled.entries import entry, kernel
 from estimators.compiled.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
 from estimators.consensus.information import fits
-from estimators.estimator import Payload, symmetrised
+from estimators.estimator import Payload
+from estimators.model.gaussian import Pair, symmetrised
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Matrix, Vector
+from estimators.model.members import MemberChange
 
 WORTHWHILE_NATS = 0.2
 """Difference in log determinant of a 6x6 marginal covariance from which on a neighbour knows an agent better."""
+
+
+class Inheritance:
+    """One agent's rounds of it; ``slot`` is the own place, which nobody knows better."""
+
+    def __init__(self, slot: int) -> None:
+        self.refused = 0
+        """Neighbours' pairs of the right tick that could not be fused."""
+        self._slot = slot
+        self._tick = 0
+        self._pair: Pair = (np.zeros((0, 0)), np.zeros(0))
+
+    def begin(self, tick: int, pair: Pair) -> None:
+        """Begin the rounds of a tick with the own pair, of the state at ``tick``."""
+        self._tick, self._pair = tick, pair
+
+    def outgoing(self) -> Payload:
+        """What neighbours get after the rounds so far; there are no weights, so no rank and no degree."""
+        return Payload(self._tick, *self._pair, rank=0)
+
+    def mix(self, received: Mapping[int, Payload], *, fuse: bool = True) -> Collection[int]:
+        """One round with what neighbours sent, by slot; gives from whom something was inherited.
+
+        Pairs of another tick are not used. With ``fuse`` false the own pair stays what it is.
+        """
+        timely = {slot: pair for slot, pair in received.items() if pair.tick == self._tick}
+        usable, better = survey(self._pair[0], timely, self._slot)
+        self.refused += len(timely) - len(usable)
+        heard: list[int] = []
+        if not better or not fuse:
+            return heard
+        for slot, pair in usable.items():
+            mixed = inherit(self._pair, (pair.information, pair.vector), self._slot)
+            if mixed is not self._pair:
+                heard.append(slot)
+            self._pair = mixed
+        return heard
+
+    def pair(self) -> Pair:
+        """The pair that the rounds made."""
+        return self._pair
+
+    def change_members(self, change: MemberChange) -> None:
+        """Go on with another fleet."""
+        self._slot = change.own
 
 
 def survey(
@@ -79,8 +126,8 @@ def _compare(
 
 
 def inherit(
-    own: tuple[Matrix, Vector], other: tuple[Matrix, Vector], slot: int, threshold: float = WORTHWHILE_NATS
-) -> tuple[Matrix, Vector]:
+    own: Pair, other: Pair, slot: int, threshold: float = WORTHWHILE_NATS
+) -> Pair:
     """The own information pair, with the agents that ``other`` knows better taken from there.
 
     ``slot`` is the own place, which is never taken. Pairs as in `estimators.estimator.Payload`.
@@ -128,11 +175,11 @@ def _log_det(covariance: Matrix, slot: int) -> float:
 
 
 def _transplant(
-    own: tuple[Matrix, Vector],
-    other: tuple[Matrix, Vector],
+    own: Pair,
+    other: Pair,
     covariance: Matrix,
     taken: np.ndarray[tuple[int], np.dtype[np.bool_]],
-) -> tuple[Matrix, Vector]:
+) -> Pair:
     """Own marginal of the states not ``taken`` times the other's conditional of those taken."""
     kept = ~taken
     marginal = np.linalg.inv(covariance[np.ix_(kept, kept)])

@@ -13,11 +13,12 @@ from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.compiled.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
+from estimators.model.corrections import add_row_information
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable
+from estimators.model.members import MemberChange
 from estimators.model.motion import predict_information
 from estimators.model.row_kernels import IntArray
-from estimators.window.kernels import add_row_information
 from estimators.window.types import WindowProblem
 
 START_SIGMA_M = 100.0
@@ -62,6 +63,10 @@ class DataInformation:
         elif slide:
             self.information = following
         return observable
+
+    def change_members(self, change: MemberChange) -> None:
+        """Go on with another fleet: of a fresh agent the data say what its prior says."""
+        self.information = change.information(self.information)
 
 
 @entry(

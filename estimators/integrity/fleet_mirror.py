@@ -21,8 +21,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
-from estimators.estimator import symmetrised
 from estimators.integrity.witness import DECISIVE_NATS, FLOOR_M, UNDERSTATED
+from estimators.model.gaussian import symmetrised
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.row_kernels import ANCHOR_RANGE, POSITION, PRECISION, VALUE, IntArray, encode_rows, predict_row

@@ -26,6 +26,7 @@ from estimators.integrity.hypotheses import (
 )
 from estimators.model.layout import block
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
+from estimators.model.members import MemberChange
 
 BLIND_TICKS = 10
 """Ticks without a position fix after which a drone that had some is taken to be without."""
@@ -190,6 +191,13 @@ class Witness:
         unsettled = len(self._places) < 3 and self._settled_ticks <= SETTLED_TICKS
         ambiguous = doubtful or weak or unsettled
         return Opinion(ambiguous, expected > OVERSTATED * claimed, moment, elsewhere)
+
+    def change_members(self, change: MemberChange) -> None:
+        """Go on with another fleet; who left or begins anew is no longer a body that ranges went to."""
+        self.slot = change.own
+        stayed = {before: slot for slot, before in change.stayed.items()}
+        kept = {key: seen for key, seen in self._places.items() if not isinstance(key, int) or key in stayed}
+        self._places = {stayed[key] if isinstance(key, int) else key: seen for key, seen in kept.items()}
 
     def _usable(self, rows: RowTable, bodies: Mapping[int, Body]) -> Iterator[_Ranged]:
         """The ranges among ``rows`` whose other end is where it is known to be."""

@@ -17,8 +17,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.estimator import symmetrised
 from estimators.integrity.observability import row_jacobian
+from estimators.model.gaussian import symmetrised
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, transition_matrix
 

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 STATES_PER_AGENT = 6
 """Position and velocity, ``[pN pE pD vN vE vD]`` in NED metres and metres per second."""
@@ -58,3 +62,9 @@ def position(slot: int) -> slice:
 def velocity(slot: int) -> slice:
     """The velocity of one agent, NED m/s."""
     return slice(STATES_PER_AGENT * slot + 3, STATES_PER_AGENT * (slot + 1))
+
+
+def states_of(slots: Sequence[int]) -> NDArray[np.int64]:
+    """Indices ``(6 len(slots),)`` of the states of some slots, in their order."""
+    firsts = STATES_PER_AGENT * np.asarray(slots, np.int64)
+    return np.asarray((firsts[:, None] + np.arange(STATES_PER_AGENT)).ravel(), np.int64)

@@ -16,66 +16,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.compiled.entries import entry, kernel
+from estimators.compiled.entries import kernel
 from estimators.model.layout import STATES_PER_AGENT
-from estimators.model.measurements import ROW, Kind, Matrix, RowTable, Vector
-from estimators.model.row_kernels import IntArray
-from estimators.window.marginalization import filter_along
+from estimators.model.measurements import Kind, Matrix, Vector
 
-SIGNIFICANT = 0.05
-"""Share of a row's variance below which what its linearisation misses is left out."""
-REWEIGHTINGS = 3
-"""How often the covariance and what the linearisation misses at it are computed from each other."""
 _RANGE, _ANCHOR_RANGE = int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
-
-
-@entry(
-    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64, float64,"
-    " float64[:, ::1], float64[::1], ROW[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
-    ROW=ROW,
-)
-def filter_reweighted(
-    rows: RowTable,
-    start: IntArray,
-    accel: Matrix,
-    accel_variance: Matrix,
-    path: Matrix,
-    dt: float,
-    eps: float,
-    information: Matrix,
-    vector: Vector,
-    weighted: RowTable,
-    next_information: Matrix,
-    next_mean: Vector,
-    covariance: Matrix,
-) -> bool:
-    """`filter_along`, with rows whose variances hold what their linearisation misses where it is significant.
-
-    That follows from the covariance and it from that: iterated from the rows as they are, so that a place that the
-    data tell is not doubted for the prior's sake. ``weighted`` ``(m,)`` gets the rows with the variances found.
-    """
-    for r in range(rows.shape[0]):
-        weighted[r] = rows[r]
-    total = np.empty(rows.shape[0])
-    for _ in range(REWEIGHTINGS + 1):
-        if not filter_along(
-            weighted, start, accel, accel_variance, path, dt, eps,
-            information, vector, next_information, next_mean, covariance,
-        ):  # fmt: skip
-            return False
-        settled = True
-        for k in range(start.shape[0] - 1):
-            for r in range(start[k], start[k + 1]):
-                measured = rows[r]["variance"]
-                missed = linearisation_variance(rows[r], path[k], covariance, eps)
-                total[r] = measured + missed if missed > SIGNIFICANT * measured else measured
-                before = weighted[r]["variance"]
-                settled = settled and abs(total[r] - before) <= SIGNIFICANT * before
-        if settled:
-            break
-        for r in range(rows.shape[0]):
-            weighted[r]["variance"] = total[r]
-    return True
 
 
 @kernel

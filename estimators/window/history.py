@@ -16,8 +16,12 @@ from estimators.model.measurements import (
     RowTable,
     empty_rows,
 )
+from estimators.model.members import MemberChange
 from estimators.model.row_kernels import IntArray, mark_usable
 from estimators.window.inputs import InputHistory
+
+_NEVER = np.iinfo(np.int64).min
+"""Of an agent of which nothing was heard."""
 
 
 class MeasurementWindow:
@@ -51,7 +55,22 @@ class MeasurementWindow:
         hold = unknown_inputs == "hold"
         self._inputs = InputHistory(layout.size, other_accel_variance, hold=hold, fade=held_accel_fade)
         self._origin: int | None = None
-        self._last_heard = np.full(layout.size, np.iinfo(np.int64).min, np.int64)
+        self._last_heard = np.full(layout.size, _NEVER, np.int64)
+
+    @property
+    def begun(self) -> bool:
+        """Whether it holds more than one tick."""
+        return self.last > self.first
+
+    @property
+    def full(self) -> bool:
+        """Whether the next tick moves its start."""
+        return self.last - self.first == self.ticks
+
+    @property
+    def next_first(self) -> int:
+        """Where it starts once the next tick is open."""
+        return max(self.first, self.last + 1 - self.ticks)
 
     def open(self, tick: int) -> bool:
         """Move the window's end to the next tick; True at the very first. Raises ``ValueError`` on a leap."""
@@ -106,6 +125,16 @@ class MeasurementWindow:
     def inputs(self) -> tuple[Matrix, Matrix]:
         """Accelerations ``(N, 3n)`` over the window's ticks and their variances, see `InputHistory`."""
         return self._inputs.table(self.first, self.last)
+
+    def change_members(self, change: MemberChange) -> None:
+        """Go on with another fleet. Rows that name an agent which did not stay are dropped; known motion is kept."""
+        self.layout = change.after
+        self._rows = _renamed(self._rows, change)
+        heard = np.full(change.after.size, _NEVER, np.int64)
+        for slot, before in change.known.items():
+            heard[slot] = self._last_heard[before]
+        self._last_heard = heard
+        self._inputs.change_members(change)
 
     def hear(self, slot: int, tick: int) -> None:
         """Note that information of an agent reached this one by another way than rows."""
@@ -193,3 +222,16 @@ def _seen_from_other_end(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.b
     for at, t, a, b in zip(between, tick, agent, other, strict=True):
         drop[at] = a > b and (int(t), int(b), int(a)) in lower
     return drop
+
+
+def _renamed(rows: RowTable, change: MemberChange) -> RowTable:
+    """Rows with the slots of the new fleet; those that name an agent which did not stay are left out."""
+    target = np.full(change.before.size + 1, -2, np.int32)
+    target[-1] = -1  # index -1, "no other end", stays what it is
+    for slot, before in change.stayed.items():
+        target[before] = slot
+    renamed = rows.copy()
+    for field in ("agent", "other", "observer"):
+        renamed[field] = target[rows[field]]
+    kept = (renamed["agent"] >= 0) & (renamed["other"] >= -1) & (renamed["observer"] >= 0)
+    return np.asarray(renamed[kept])

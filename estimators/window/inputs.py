@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.model.measurements import INPUT, InputTable, Matrix, empty_inputs
+from estimators.model.members import MemberChange
 from estimators.model.row_kernels import IntArray
 
 HISTORY_TICKS = 50
@@ -52,14 +51,14 @@ class InputHistory:
         if len(self._known) and self._known["tick"][0] < limit:
             self._known = self._known[np.searchsorted(self._known["tick"], limit) :]
 
-    def take_over(self, other: InputHistory, slots: Mapping[int, int]) -> None:
-        """Know of each slot in ``slots`` what another history knows of the slot that it stands for there."""
-        known = other._known
-        parts = [known[known["agent"] == there] for there in slots.values()]
-        for slot, part in zip(slots, parts, strict=True):
+    def change_members(self, change: MemberChange) -> None:
+        """Go on with another fleet: what is known of an agent's motion goes to its new slot."""
+        parts = [self._known[self._known["agent"] == before] for before in change.known.values()]
+        for slot, part in zip(change.known, parts, strict=True):
             part["agent"] = slot
         table = np.concatenate([empty_inputs(), *parts])
         self._known = np.ascontiguousarray(table[np.lexsort((table["agent"], table["tick"]))], INPUT)
+        self._agents = change.after.size
 
     def table(self, first: int, last: int) -> tuple[Matrix, Matrix]:
         """Accelerations ``(last - first, 3n)`` over the ticks from ``first`` on, and their variances."""

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from estimators.compiled.entries import entry, kernel
 from estimators.compiled.linear_algebra import factor_upper, inverse_from_cholesky, solve_upper
 from estimators.consensus.information import combine
+from estimators.model.corrections import add_row_information
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.motion import predict_information, predict_state, transpose_predict
@@ -23,10 +24,8 @@ from estimators.model.row_kernels import (
     HALF_WIDTH,
     PRECISION,
     IntArray,
-    add_curvature,
     add_gradient,
     encode_rows,
-    predict_row,
 )
 from estimators.solvers.gauss_newton import minimise
 from estimators.window.pre_estimation import pre_estimate
@@ -104,19 +103,6 @@ def arrival_update(
         return False
     add_row_information(rows, state, eps, out)
     return True
-
-
-@kernel
-def add_row_information(rows: RowTable, state: Vector, eps: float, information: Matrix) -> None:
-    """information += C' R^-1 C of rows linearised at ``state`` ``(6n,)``."""
-    m = rows.shape[0]
-    code = np.empty((m, 3), np.int64)
-    data = np.empty((m, 7))
-    unit = np.empty(4)
-    encode_rows(rows, np.arange(state.shape[0] // STATES_PER_AGENT), code, data)
-    for r in range(m):
-        predict_row(code, data, r, state, eps, unit)
-        add_curvature(code, data, r, unit, data[r, PRECISION], 0.0, information)
 
 
 @entry(

@@ -4,19 +4,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
-
-from estimators.consensus.information import Pairs
+from estimators.consensus.information import NO_PAIRS, Pairs
 from estimators.estimator import SolverReport, Status
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.row_kernels import IntArray
 
-NO_PAIRS = Pairs(np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
-
 
 @dataclass(slots=True)
 class WindowProblem:
-    """A window as its estimator hands it over; shapes as in `window_kernels.moving_horizon_step`."""
+    """A window as its estimator hands it over; shapes as in `estimators.window.kernels.moving_horizon_step`."""
 
     rows: RowTable
     start: IntArray

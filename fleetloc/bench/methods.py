@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from estimators.settings import EstimatorSettings, default_settings
+from estimators.settings import EstimatorSettings, default_settings, present_name
 from fleetloc.errors import InputError
 from sim_bridge.studies.genie import Genie
 from sim_bridge.studies.monte_carlo import Method
 
-FLAGSHIP = "dmhe_relay"
+FLAGSHIP = "dmhe_shared"
 CENTRALISED = "centralized_iekf"
 """The yardstick: all rows and all inputs at once, whatever the links do."""
 GENIE = "genie"
@@ -40,7 +40,7 @@ def methods_with_genie() -> dict[str, Method]:
 
 def chosen(methods: Mapping[str, Method], names: str, always: Sequence[str] = ()) -> dict[str, Method]:
     """Those of the comma-separated ``names`` (empty: all), and those that a study needs; raises `InputError`."""
-    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    wanted = [present_name(name.strip()) for name in names.split(",") if name.strip()]
     unknown = [name for name in wanted if name not in methods]
     if unknown:
         raise InputError("--methods", "", f"some of {', '.join(methods)}", ", ".join(unknown))

@@ -165,7 +165,7 @@ def loss(
 def blind(
     runs: Runs = 20,
     seed: Seed = 0,
-    methods: Methods = "dmhe_pre_ekf,dekf_ci_shared,dmhe_relay,centralized_iekf",
+    methods: Methods = "dmhe_pre_ekf,dekf_ci_shared,dmhe_shared,centralized_iekf",
     jobs: Jobs = 0,
     json_file: JsonFile = None,
 ) -> None:

@@ -13,8 +13,9 @@ from itertools import pairwise
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.estimator import Estimate, SolverReport, Status, symmetrised
+from estimators.estimator import Estimate, SolverReport, Status
 from estimators.integrity.observability import row_jacobian
+from estimators.model.gaussian import symmetrised
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix

@@ -170,7 +170,7 @@ def test_information_about_other_members_is_mapped_and_used_once(
     make_config: MakeConfig, agents: tuple[int, ...]
 ) -> None:
     # GIVEN a neighbour that sees another fleet than we do, WHEN its pair comes twice
-    core, made = lone(make_config, "estimator.kind=dmhe_relay", count=2)
+    core, made = lone(make_config, "estimator.kind=dmhe_shared", count=2)
     core.advance(100.0, CONNECTED)
     for _ in range(2):
         core.on_packet(received(2, information(1000, agents=agents)), 100.1)
@@ -256,7 +256,7 @@ def test_a_drone_without_gps_lives_on_its_neighbours(make_config: MakeConfig) ->
 def test_a_drone_that_never_had_gps_says_so_until_its_ranges_leave_one_place(
     make_config: MakeConfig
 ) -> None:
-    config = make_config(5, "initial.max_wait_s=2.0", "estimator.kind=dmhe_relay", "estimator.window=4")
+    config = make_config(5, "initial.max_wait_s=2.0", "estimator.kind=dmhe_shared", "estimator.window=4")
     fleet = CirclingFleet(config, blind=lambda agent_id, t_s: agent_id == 5)
     fleet.run(9)
     statuses = [r.estimate.status for r in fleet.estimates[5]]

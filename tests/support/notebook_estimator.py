@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from agent.config.tables import FleetConfig
 from agent.core import AgentCore
 from agent.sensing.samples import GpsSample
 from estimators.estimator import Estimate, Payload, Status
+from estimators.model.gaussian import Prior
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.settings import EstimatorSettings
@@ -25,6 +26,8 @@ MakeConfig = Callable[..., FleetConfig]
 class Notebook:
     """An estimator that notes its calls and answers with its prior; ``fail`` says what goes wrong when."""
 
+    fixed_members = True
+
     def __init__(
         self,
         settings: EstimatorSettings,
@@ -38,6 +41,10 @@ class Notebook:
         self.mean, self.covariance = mean, covariance
         self.calls: list[tuple[Any, ...]] = []
         self.tick = 0
+
+    @property
+    def prior_tick(self) -> int:
+        return self.tick
 
     fail: Callable[[str, int], None] = staticmethod(lambda call, tick: None)
 
@@ -60,6 +67,9 @@ class Notebook:
         mean = np.full_like(self.mean, np.nan) if self.fail("nan", self.tick) else self.mean
         ages = np.zeros(self.layout.size, np.int64)
         return Estimate(self.tick, mean, self.covariance, Status.OK, ages)
+
+    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+        raise RuntimeError("the fleet of a notebook is fixed")
 
 
 def received(sender: int, message: Any, now_s: float = 0.0) -> Received:

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.consensus.information import Pairs, fuse, weigh
+from estimators.consensus.information import NO_PAIRS, Pairs, fuse, weigh
 from estimators.estimator import Estimate, Estimator, Payload
 from estimators.factory import make_estimator
 from estimators.model.layout import Layout
@@ -22,7 +22,7 @@ from estimators.model.motion import predict_mean
 from estimators.model.row_kernels import IntArray
 from estimators.settings import EstimatorSettings
 from estimators.window.history import MeasurementWindow
-from estimators.window.types import NO_PAIRS, WindowProblem
+from estimators.window.types import WindowProblem
 from fleetloc.errors import InputError
 from sim_bridge.studies.lockstep import neighbours, own_input, own_rows
 from sim_bridge.studies.recording import Recording

@@ -163,13 +163,13 @@ def test_files_that_cannot_be_read_are_named(tmp_path: Path) -> None:
 
 def test_a_kind_brings_its_own_defaults_and_what_is_written_beats_them() -> None:
     nothing_said = load_estimator_settings(None)
-    assert (nothing_said.kind, nothing_said.window, nothing_said.relay_hops) == ("dmhe_relay", 6, 2)
+    assert (nothing_said.kind, nothing_said.window, nothing_said.relay_hops) == ("dmhe_shared", 6, 2)
     assert nothing_said == load_config(LINE3).estimator
     paper = load_estimator_settings(None, ["estimator.kind=dmhe_pre_ekf"])
     assert paper == EstimatorSettings()
     assert (paper.window, paper.rounds, paper.share_inputs, paper.relay_hops) == (2, 1, "none", 0)
     longer = load_estimator_settings(None, ["estimator.window=9"])
-    assert (longer.kind, longer.window, longer.share_inputs) == ("dmhe_relay", 9, "fleet")
+    assert (longer.kind, longer.window, longer.share_inputs) == ("dmhe_shared", 9, "fleet")
 
 
 def test_drones_with_addresses_on_the_radio_may_have_the_same_device() -> None:

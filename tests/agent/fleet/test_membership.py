@@ -81,7 +81,7 @@ class Agent:
 
 @pytest.fixture
 def agent(make_config: MakeConfig) -> Agent:
-    overrides = ("estimator.kind=dmhe_relay", "estimator.window=3", "fleet.absent_after_s=3.0", "estimator.rounds=0")
+    overrides = ("estimator.kind=dmhe_shared", "estimator.window=3", "fleet.absent_after_s=3.0", "estimator.rounds=0")
     return Agent(make_config(5, *overrides))
 
 
@@ -175,7 +175,7 @@ def test_a_fault_while_the_fleet_changes_leaves_who_was_there(make_config: MakeC
     # GIVEN an estimator that fails at the tick at which drone 3 joins
     broken: list[int] = []
 
-    agent = Agent(make_config(3, "estimator.kind=dmhe_relay", "estimator.window=3", "estimator.rounds=0"))
+    agent = Agent(make_config(3, "estimator.kind=dmhe_shared", "estimator.window=3", "estimator.rounds=0"))
     agent.run(20, heard=(1, 2))
     original = agent.store.take
 

@@ -189,7 +189,7 @@ def test_in_the_core_the_estimate_follows_what_is_learned(make_config: Callable[
     # GIVEN the same flight of a minute with and without estimation of the latency
     # (with a window that late fixes fit into)
     changed = ["sensors.gps_position_half_width_m=0.1", "sensors.gps_speed_half_width_mps=0.1"]
-    changed += ["estimator.kind=dmhe_relay", "estimator.window=6"]
+    changed += ["estimator.kind=dmhe_shared", "estimator.window=6"]
     on = Flight(make_config(1, *changed), Course.eight()).run(60.0)
     off = Flight(make_config(1, *changed, "sensors.estimate_latency=false"), Course.eight()).run(60.0)
     again = Flight(make_config(1, *changed), Course.eight()).run(60.0)

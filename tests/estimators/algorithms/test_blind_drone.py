@@ -25,7 +25,7 @@ from sim_bridge.studies.study_scenario import Scenario
 
 Array = NDArray[np.float64]
 RELAY = EstimatorSettings(
-    kind="dmhe_relay", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
+    kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
 )
 
 

@@ -24,7 +24,7 @@ from sim_bridge.studies.study_scenario import Scenario
 from tests.support import builders
 from tests.support import dense_reference as dense
 
-ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf")
+ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf")
 DT, EPS = 0.1, 1e-3
 TIGHT = EstimatorSettings(tolerance=1e-10, max_iterations=500)
 

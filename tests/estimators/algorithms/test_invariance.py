@@ -25,7 +25,7 @@ from sim_bridge.studies.study_scenario import Scenario
 from tests.support import builders
 
 Array = NDArray[np.float64]
-ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf")
+ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf")
 ROUNDING_M = 1e-6
 
 

@@ -9,30 +9,23 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimators.algorithms.membership import (
-    FLAT_INFORMATION,
-    mapped_pair,
-    mapped_payload,
-    marginal_pair,
-    prior_tick,
-    silence_sigma_m,
-    states_of,
-    with_members,
-)
+from estimators.consensus.mapping import FLAT_INFORMATION, mapped_pair, mapped_payload
 from estimators.estimator import Estimate
 from estimators.factory import make_estimator
-from estimators.model.layout import Layout
+from estimators.model.gaussian import marginal_pair
+from estimators.model.layout import Layout, states_of
 from estimators.model.measurements import RowTable, input_rows, position_rows, range_row, speed_row
 from estimators.model.motion import input_matrix, transition_matrix
+from estimators.model.unknown_motion import silence_sigma_m
 from estimators.settings import EstimatorSettings
 from tests.support.builders import fly, random_covariance
 
 DT = 0.1
-KINDS = ["dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci"]
+KINDS = ["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci"]
 
 
 def settings(kind: str) -> EstimatorSettings:
-    hold: Any = "hold" if kind == "dmhe_relay" else "zero"
+    hold: Any = "hold" if kind == "dmhe_shared" else "zero"
     return EstimatorSettings(kind=kind, window=3, rounds=0, unknown_inputs=hold)  # type: ignore[arg-type]
 
 
@@ -81,7 +74,7 @@ class Flight:
 
     def change(self, ids: tuple[int, ...], fresh: dict[int, Any] | None = None) -> None:
         self.ids = ids
-        self.estimator = with_members(self.estimator, ids, 1, fresh or {})
+        self.estimator.change_members(ids, 1, fresh or {})
 
 
 INPUT = input_rows(0, 0, np.zeros(3), 1.0).dtype
@@ -125,8 +118,7 @@ def test_a_wide_newcomer_does_not_move_the_others_until_something_relates_them(k
 def test_a_newcomer_is_known_as_well_as_the_others_after_a_window_of_its_fixes(kind: str) -> None:
     flight = Flight(kind, (1, 2))
     flight.run(0, 12)
-    tick = prior_tick(flight.estimator)
-    truth = flight.states[tick, 18:24]
+    truth = flight.states[flight.estimator.prior_tick, 18:24]
     start = truth + np.array([0.3, -0.2, 0.1, 0.2, 0.2, 0.0])
     flight.change((1, 2, 4), {4: (start, np.diag([25.0] * 3 + [9.0] * 3))})
     last = flight.run(12, 26)[-1]
@@ -146,22 +138,24 @@ def test_a_replaced_block_forgets_where_it_was_and_stays_in_order(kind: str) -> 
     rows = flight.estimator.window.rows()[0]
     # THEN rows that name it are gone, those between the others are kept, and it is independent of them
     assert len(rows) == np.count_nonzero((before["agent"] != 0) & (before["other"] != 0)) > 0
-    mean, information = (
-        (flight.estimator.prior_mean, flight.estimator.prior_information)
-        if kind != "dekf_ci"
-        else (flight.estimator._mean, flight.estimator._information)
-    )
-    assert mean[:6] == pytest.approx(place[0])
-    assert information[:6, :6] == pytest.approx(0.25 * np.eye(6))
-    assert not information[:6, 6:].any()
-    assert all(np.isfinite(e.mean).all() for e in flight.run(10, 20))
+    flight.estimator.begin(10, rows[:0], np.zeros(0, INPUT))
+    told = flight.estimator.outgoing(0)
+    assert not told.information[:6, 6:].any()
+    mean, covariance = place
+    if told.tick == 10:  # a filter: one tick after what the prior speaks of
+        move, push = transition_matrix(1, DT), input_matrix(1, DT)
+        mean, covariance = move @ mean, move @ covariance @ move.T + 4 / 3 * push @ push.T
+    assert told.information[:6, :6] == pytest.approx(np.linalg.inv(covariance))
+    assert np.linalg.solve(told.information, told.vector)[:6] == pytest.approx(mean)
+    flight.estimator.solve()
+    assert all(np.isfinite(e.mean).all() for e in flight.run(11, 20))
 
 
 def test_agents_that_are_neither_old_nor_fresh_are_refused() -> None:
-    flight = Flight("dmhe_relay", (1, 2))
+    flight = Flight("dmhe_shared", (1, 2))
     flight.run(0, 3)
     with pytest.raises(KeyError, match="agent 3 is not in the fleet"):
-        with_members(flight.estimator, (1, 2, 3), 1, {})
+        flight.estimator.change_members((1, 2, 3), 1, {})
 
 
 # --- pairs -------------------------------------------------------------------------------------------------
@@ -202,7 +196,7 @@ def test_to_the_same_agents_in_another_order_nothing_is_lost(sender: list[int], 
 
 def test_a_mapped_payload_is_definite_and_pulls_unknown_agents_nowhere() -> None:
     rng = np.random.default_rng(1)
-    flight = Flight("dmhe_relay", (1, 2))
+    flight = Flight("dmhe_shared", (1, 2))
     flight.run(0, 6)
     payload = flight.estimator.outgoing(0)
     centre = 100.0 * rng.normal(size=18)

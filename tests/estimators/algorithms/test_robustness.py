@@ -25,7 +25,7 @@ from estimators.window.types import WindowProblem
 from tests.support import builders
 
 Array = NDArray[np.float64]
-ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf")
+ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf")
 STATUSES = {Status.OK, Status.NOT_CONVERGED, Status.FELL_BACK, Status.NOT_OBSERVABLE, Status.NO_DATA}
 
 
@@ -265,7 +265,7 @@ BAD_PAIRS: dict[str, tuple[Array, Array, int]] = {
 
 
 @pytest.mark.parametrize("spoil", BAD_PAIRS)
-@pytest.mark.parametrize("kind", ["dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci"])
+@pytest.mark.parametrize("kind", ["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci"])
 def test_bad_pair_of_a_neighbour_is_left_out_and_counted(kind: EstimatorKind, spoil: str) -> None:
     # GIVEN an agent whose neighbour sends nonsense, and one that hears nobody
     information, vector, rank = BAD_PAIRS[spoil]

@@ -16,7 +16,7 @@ from estimators.model.measurements import RowTable, empty_inputs, empty_rows, in
 from estimators.settings import EstimatorSettings
 
 RELAY = EstimatorSettings(
-    kind="dmhe_relay", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
+    kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
 )
 PLACES = np.array([[0.0, 0.0, -5.0], [9.0, 1.0, 0.0], [-6.0, 7.0, 0.0], [-5.0, -8.0, 1.0], [1.0, 0.0, -14.0]])
 DT = 0.1

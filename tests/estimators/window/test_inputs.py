@@ -5,7 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimators.model.layout import Layout
 from estimators.model.measurements import input_rows
+from estimators.model.members import MemberChange
 from estimators.settings import EstimatorSettings, fade_per_tick
 from estimators.window.inputs import HISTORY_TICKS, InputHistory
 
@@ -101,15 +103,13 @@ def test_memory_is_bounded() -> None:
     assert made.table(499, 500)[0][0, 3] == 1.0
 
 
-def test_a_history_takes_over_what_another_knows_of_the_same_agents() -> None:
-    # GIVEN a history of two agents, and one of three in which the second of them is the first
-    old, new = history(True, {4: 0.5, 5: 0.6}, slot=1), InputHistory(3, OTHER, hold=True)
-    old.insert(input_rows(5, 0, np.full(3, 0.1), NOISE), 0)
-    new.take_over(old, {2: 0, 0: 1})
+def test_in_another_fleet_a_history_knows_the_same_of_the_same_agents() -> None:
+    # GIVEN a history of two agents, WHEN they go on in another order with a third between them
+    made = history(True, {4: 0.5, 5: 0.6}, slot=1)
+    made.insert(input_rows(5, 0, np.full(3, 0.1), NOISE), 0)
+    made.change_members(MemberChange.between(Layout((1, 2)), (2, 3, 1), 1, {3: (np.zeros(6), np.eye(6))}))
     # THEN it knows the same of them, and goes on
     for tick, slot, value in ((5, 2, 9.0), (4, 1, 0.7)):
-        new.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)
-    accel, _ = new.table(4, 6)
+        made.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)
+    accel, _ = made.table(4, 6)
     assert accel[:, ::3].tolist() == [[0.5, 0.7, 0.0], [0.6, 0.0, 0.1]]
-    # and the other one is as it was
-    assert old.table(5, 6)[0][0, ::3].tolist() == [0.1, 0.6]

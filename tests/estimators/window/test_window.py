@@ -84,7 +84,7 @@ def test_late_rows_give_the_estimate_of_rows_in_time(kind: EstimatorKind) -> Non
             late.begin(tick, empty_rows(), empty_inputs())
         elif tick == 4:
             before = builders.all_inputs(3, accel, 0.01)
-            late.prior_mean = in_time.prior_mean.copy()  # while the window grows, each tick's solution moves it
+            late.arrival = in_time.arrival  # while the window grows, each tick's solution moves it
             late.begin(tick, np.concatenate([rows[4], rows[3]])[::-1], np.concatenate([inputs, before]))
         else:
             late.begin(tick, rows[tick], inputs)

@@ -28,7 +28,8 @@ from sim_bridge.studies.study_scenario import GRAPHS, Scenario
 def test_methods_are_chosen_by_name() -> None:
     methods = methods_with_genie()
     assert list(chosen(methods, "")) == list(methods)
-    assert list(chosen(methods, " genie, dmhe_relay")) == [FLAGSHIP, GENIE]
+    assert list(chosen(methods, " genie, dmhe_shared")) == [FLAGSHIP, GENIE]
+    assert list(chosen(methods, "dmhe_relay")) == [FLAGSHIP]  # its former name
     with pytest.raises(InputError, match=r"--methods: expected some of .*, found kalman"):
         chosen(methods, "dmhe,kalman")
 

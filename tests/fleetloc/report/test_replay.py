@@ -256,7 +256,7 @@ def test_the_shipped_configurations_are_right() -> None:
         config = load_config(CONFIGS / name)
         assert config.ids == (1, 2, 3)
         assert {agent.autopilot for agent in config.agents} == {flavour}
-        assert config.estimator.kind == "dmhe_relay"
+        assert config.estimator.kind == "dmhe_shared"
 
 
 # --- ranges --------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from sim_bridge.studies.study_scenario import Scenario
 
 def relay(window: int) -> EstimatorSettings:
     return EstimatorSettings(
-        kind="dmhe_relay", window=window, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
+        kind="dmhe_shared", window=window, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
     )
 
 

@@ -20,7 +20,7 @@ from sim_bridge.studies.relay import RecordRelay
 from sim_bridge.studies.study_scenario import Scenario
 
 RECORDING = Scenario("K5", samples=2000).record(0, 0)
-SETTINGS = EstimatorSettings(kind="dmhe_relay", window=4, rounds=2, share_inputs="fleet", relay_hops=2)
+SETTINGS = EstimatorSettings(kind="dmhe_shared", window=4, rounds=2, share_inputs="fleet", relay_hops=2)
 SIGMA = 4.0 / np.sqrt(RECORDING.received.size)
 """Four standard deviations of a share of all packets, at most."""
 

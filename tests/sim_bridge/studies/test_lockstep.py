@@ -15,7 +15,7 @@ from sim_bridge.studies.lockstep import Links, neighbours, own_input, own_rows, 
 from sim_bridge.studies.recording import Recording
 from sim_bridge.studies.study_scenario import Scenario
 
-ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_relay", "dekf_ci", "centralized_ekf")
+ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf")
 
 
 @pytest.fixture

@@ -21,7 +21,7 @@ from transport.messages.measurement_body import (
 )
 
 ONE_HOP = EstimatorSettings()
-TWO_HOPS = EstimatorSettings(kind="dmhe_relay", relay_hops=1, rounds=2, window=3)
+TWO_HOPS = EstimatorSettings(kind="dmhe_shared", relay_hops=1, rounds=2, window=3)
 
 
 def line(samples: int = 12):  # type: ignore[no-untyped-def]

@@ -11,11 +11,11 @@ from agent.config.reading import load_config
 from agent.fleet.membership import is_absent
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
-from estimators.algorithms.membership import silence_sigma_m, states_of
 from estimators.estimator import Status
 from estimators.factory import make_estimator
 from estimators.integrity.consistency import nees
-from estimators.model.layout import Layout, block
+from estimators.model.layout import Layout, block, states_of
+from estimators.model.unknown_motion import silence_sigma_m
 from sim_bridge.virtual.fleet_events import FleetEvents, Partition
 from sim_bridge.virtual.fleet_lockstep import Fidelity, FleetLockstep, Surroundings
 from sim_bridge.world.scenario import Interval

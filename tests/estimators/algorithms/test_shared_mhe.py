@@ -16,7 +16,7 @@ from sim_bridge.studies.lockstep import run_lockstep
 from sim_bridge.studies.study_scenario import Scenario
 
 RELAY = EstimatorSettings(
-    kind="dmhe_relay", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
+    kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
 )
 DT = 0.1
 

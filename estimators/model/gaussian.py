@@ -1,0 +1,49 @@
+"""Beliefs about a fleet's state, in moment and in information form."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.model.layout import block, states_of
+from estimators.model.measurements import Matrix, Vector
+
+Pair = tuple[Matrix, Vector]
+"""Information matrix ``(6n, 6n)`` and vector ``(6n,)``, the matrix times the mean."""
+Prior = tuple[Vector, Matrix]
+"""Mean ``(6,)`` and covariance ``(6, 6)`` of one agent, NED m and m/s."""
+
+
+def symmetrised(matrix: NDArray[Any]) -> Matrix:
+    """The symmetric part of a square matrix."""
+    return np.asarray(0.5 * (matrix + matrix.T), np.float64)
+
+
+def marginal_pair(pair: Pair, slots: Sequence[int]) -> Pair:
+    """The information pair of some slots alone, the others eliminated.
+
+    With the kept states K and the others O: ``I_KK - I_KO I_OO^-1 I_OK`` and ``i_K - I_KO I_OO^-1 i_O``. Raises
+    ``numpy.linalg.LinAlgError`` where ``I_OO`` is singular.
+    """
+    information, vector = pair
+    kept = states_of(slots)
+    others = np.setdiff1d(np.arange(len(vector)), kept)
+    marginal, right = information[np.ix_(kept, kept)], vector[kept]
+    if len(others):
+        cross = information[np.ix_(kept, others)]
+        columns = np.column_stack((cross.T, vector[others]))
+        solved = np.linalg.solve(information[np.ix_(others, others)], columns)
+        marginal, right = marginal - cross @ solved[:, :-1], right - cross @ solved[:, -1]
+    return symmetrised(marginal), np.asarray(right)
+
+
+def covering(covariance: Matrix, own: Matrix, slot: int) -> Matrix:
+    """The fleet's covariance with another one of an agent's state ``(6, 6)``, uncorrelated with the others."""
+    out = covariance.copy()
+    out[block(slot), :] = 0.0
+    out[:, block(slot)] = 0.0
+    out[block(slot), block(slot)] = own
+    return symmetrised(out)

@@ -14,7 +14,7 @@ RUN python3 dependencies.py pyproject.toml > wanted.txt \
     && pip install --requirement wanted.txt --constraint requirements.lock
 COPY docker/prune.py .
 RUN python3 prune.py /opt/fleetloc
-COPY README.md LICENSE ./
+COPY README.md LICENSE setup.py ./
 COPY estimators estimators
 COPY transport transport
 COPY agent agent

@@ -1,4 +1,4 @@
-"""Take out of an environment what never runs in a fleet: the tests of libraries and unused MAVLink dialects.
+"""Take out of an environment what never runs in a fleet: the tests of libraries.
 
 ``python prune.py PREFIX``; says what it freed.
 """
@@ -7,19 +7,13 @@ import shutil
 import sys
 from pathlib import Path
 
-DIALECT = "ardupilotmega"
-"""The one dialect that is spoken (v2.0)."""
 TESTED = ("numba", "scipy", "matplotlib", "mpl_toolkits")
 """Libraries whose folders named tests nothing imports."""
 
 
 def unneeded(packages: Path) -> list[Path]:
-    """Folders and files to remove, none inside another."""
-    found = [folder for name in TESTED for folder in (packages / name).rglob("tests") if folder.is_dir()]
-    dialects = packages / "pymavlink" / "dialects"
-    found += [folder for folder in dialects.iterdir() if folder.is_dir() and folder.name != "v20"]
-    found += [file for file in (dialects / "v20").iterdir() if file.stem not in (DIALECT, "__init__")]
-    return found
+    """Folders to remove, none inside another."""
+    return [folder for name in TESTED for folder in (packages / name).rglob("tests") if folder.is_dir()]
 
 
 def size_bytes(path: Path) -> int:
@@ -32,8 +26,5 @@ def size_bytes(path: Path) -> int:
 freed = 0
 for path in unneeded(site):
     freed += size_bytes(path)
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
+    shutil.rmtree(path)
 sys.stdout.write(f"pruned {freed / 1e6:.0f} MB\n")

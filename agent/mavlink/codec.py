@@ -8,8 +8,7 @@ from __future__ import annotations
 from collections import Counter
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from agent.mavlink.dialect import mavlink
 from agent.mavlink.signing import LinkSigning
 
 __all__ = ["Decoder", "Encoder", "Message", "mavlink"]

@@ -10,8 +10,7 @@ import math
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.flavours import FlightMode
 from sim_bridge.autopilot.mavlink_wire import Message
 from sim_bridge.autopilot.state import AutopilotState, Vehicle

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from agent.mavlink.dialect import mavlink
 from agent.sensing.frames import normalised, rotated
 from sim_bridge.autopilot.flavours import Flavour
 from sim_bridge.world.quaternions import Array

@@ -11,9 +11,9 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from agent.mavlink.codec import Decoder, Encoder
+from agent.mavlink.dialect import mavlink
 from agent.mavlink.signing import LinkSigning
 from agent.sensing.frames import FleetFrame, rotated
 from sim_bridge.autopilot import mavlink_wire as wire

@@ -5,8 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from agent.mavlink.dialect import mavlink
 from sim_bridge.world.quaternions import Array, to_euler
 from sim_bridge.world.sensors import AttitudeSample, GpsFix, ImuSample
 

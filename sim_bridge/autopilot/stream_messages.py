@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot import mavlink_wire as wire
 from sim_bridge.autopilot.mavlink_wire import Message
 from sim_bridge.autopilot.state import AutopilotState, Vehicle

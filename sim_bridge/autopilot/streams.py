@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import math
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.flavours import Flavour
 
 TOLERANCE_S = 1e-6

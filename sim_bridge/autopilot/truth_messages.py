@@ -8,8 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
-
+from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.mavlink_wire import STANDARD_GRAVITY_MPS2, Message, int16, millimetres
 from sim_bridge.world.quaternions import Array, to_euler
 

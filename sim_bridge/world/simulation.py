@@ -12,8 +12,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
+from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.fake_autopilot import AutopilotSetup, FakeAutopilot
 from sim_bridge.autopilot.link_faults import FaultyLink
 from sim_bridge.autopilot.truth_messages import TrueState

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import importlib.util
 import os
 import shutil
 import subprocess
 import sys
+import tomllib
 import zipfile
 from pathlib import Path
 
@@ -14,7 +16,9 @@ import pytest
 from fleetloc import shadowing
 
 ROOT = Path(__file__).parents[2]
-NEEDED = (*shadowing.ROOMS, "configs", "deploy", "pyproject.toml", "README.md", "LICENSE")
+NEEDED = (*shadowing.ROOMS, "configs", "deploy", "pyproject.toml", "setup.py", "README.md", "LICENSE")
+CODEC = "mavlink/ardupilotmega.py"
+"""In the agent's package: what `setup.py` adds to a wheel."""
 BUILD = "import sys, setuptools.build_meta as build; print(build.build_wheel(sys.argv[1]))"
 
 
@@ -50,8 +54,28 @@ def test_a_wheel_holds_examples_unit_web_page_and_types(site: Path) -> None:
 
 def test_a_wheel_holds_every_module_and_nothing_else_at_the_top(site: Path) -> None:
     for room in shadowing.ROOMS:
-        assert names(site / room, "*.py") == names(ROOT / room, "*.py")
+        more = [CODEC] if room == "agent" else []
+        assert names(site / room, "*.py") == sorted(names(ROOT / room, "*.py") + more)
     assert sorted(path.name for path in site.iterdir() if path.suffix != ".dist-info") == sorted(shadowing.ROOMS)
+
+
+def test_a_wheel_speaks_mavlink_without_pymavlink(site: Path, tmp_path: Path) -> None:
+    """GIVEN an installed wheel WHEN its codec is loaded THEN it is the copy, which is pymavlink's file."""
+    look = "import sys; from agent.mavlink.dialect import mavlink as m; print(m.__file__, 'pymavlink' in sys.modules)"
+    done = subprocess.run(
+        [sys.executable, "-P", "-c", look], cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(site)},
+        capture_output=True, text=True, check=True, timeout=60,
+    )  # fmt: skip
+    assert done.stdout.split() == [str(site / "agent" / CODEC), "False"]
+    spec = importlib.util.find_spec("pymavlink.dialects.v20.ardupilotmega")
+    assert spec is not None
+    assert (site / "agent" / CODEC).read_bytes() == Path(str(spec.origin)).read_bytes()
+
+
+def test_a_wheel_is_built_with_the_pymavlink_that_is_tested() -> None:
+    requires = tomllib.loads((ROOT / "pyproject.toml").read_text())["build-system"]["requires"]
+    (codec,) = [each for each in requires if each.startswith("pymavlink")]
+    assert codec in (ROOT / "requirements.lock").read_text().splitlines()
 
 
 def test_what_is_unpacked_flies_the_demo_from_another_folder(site: Path, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 from pathlib import Path
 
 import pytest
@@ -43,9 +44,8 @@ async def test_ranges_of_a_driver_reach_the_daemon_of_its_drone(config_file: Pat
             assert key == driver.key == "cl/v1/watched/agent/001/uwb"
     finally:
         await daemon.close()
-    samples = UwbAdapter(1, (2, 3), SensorsTable(uwb_max_age_s=1000.0)).receive(
-        frame, now_s=100.0, host_s=asyncio.get_running_loop().time(), unix_s=1.8e9
-    )
+    taken_s = json.loads(frame)["t"] * 1e-9
+    samples = UwbAdapter(1, (2, 3), SensorsTable()).receive(frame, now_s=100.0, host_s=taken_s, unix_s=1.8e9)
     assert [(sample.target, sample.range_m) for sample in samples] == [(2, 12.5), (3, 7.0)]
 
 

@@ -55,8 +55,8 @@ from transport.errors import KeyFileError, SessionError, SettingsError, Unwritab
 LOG = logging.getLogger("fleetloc.agent")
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
-    (ConfigError, ExitCode.CONFIG),
-    (SettingsError, ExitCode.CONFIG),
+    (ConfigError, ExitCode.BAD_INPUT),
+    (SettingsError, ExitCode.BAD_INPUT),
     (NoAutopilotError, ExitCode.NO_AUTOPILOT),
     (LinkError, ExitCode.LINK),
     (UnwritableError, ExitCode.STATE),

@@ -19,6 +19,7 @@ import typer
 
 import fleetloc
 from fleetloc import commands
+from fleetloc.common_options import complete
 from fleetloc.errors import BAD_INPUT, FAILED, INTERRUPTED, REFUSED
 from fleetloc.shadowing import ROOMS
 
@@ -45,13 +46,14 @@ def build_app() -> typer.Typer:
     """The command line with every group of commands in this package."""
     app = typer.Typer(
         name="fleetloc",
-        add_completion=False,
+        context_settings={"help_option_names": ["-h", "--help"]},
         pretty_exceptions_enable=False,
         rich_markup_mode=None,
     )
     app.callback(invoke_without_command=True)(_root)
     for module in pkgutil.iter_modules(commands.__path__):
         importlib.import_module(f"{commands.__name__}.{module.name}").register(app)
+    complete(app)
     return app
 
 

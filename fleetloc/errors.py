@@ -4,15 +4,7 @@ FleetlocError          exit code 1
 ├── InputError         2: a file or an option cannot be used
 └── EnvironmentFault   3: the machine refuses (port taken, no such device, nobody answers)
 
-=====  =====================================================================================
-code   meaning
-=====  =====================================================================================
-0      done
-1      the run failed, or a fault in fleetloc itself (then with a traceback: please report it)
-2      bad input: an option, a configuration, a recording; the line says what was expected
-3      the machine refused: a file, port or device cannot be opened, a peer never appeared
-130    interrupted (Ctrl-C)
-=====  =====================================================================================
+`agent.exit_codes.ExitCode` says what each number means, for all commands.
 
 An error class of another room may carry its own ``exit_code``; without one it is bad input (2), or the
 machine's refusal (3) where it is an ``OSError``.
@@ -20,10 +12,12 @@ machine's refusal (3) where it is an ``OSError``.
 
 from __future__ import annotations
 
-FAILED = 1
-BAD_INPUT = 2
-REFUSED = 3
-INTERRUPTED = 130
+from agent.exit_codes import ExitCode
+
+FAILED: int = ExitCode.FAILURE
+BAD_INPUT: int = ExitCode.BAD_INPUT
+REFUSED: int = ExitCode.REFUSED
+INTERRUPTED: int = ExitCode.INTERRUPTED
 
 
 class FleetlocError(Exception):

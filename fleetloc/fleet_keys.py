@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,7 +105,7 @@ class FleetKeys:
         """A line for each agent and each thing that the fleet shares; raises `KeyFileError`."""
         for info in list_keys(self.folder):
             secret = "secret here" if info.has_secret else "public only"
-            parts = [f"agent {info.agent_id:3d}  {secret}  {'  '.join(info.fingerprints)}"]
+            parts = [f"agent {info.agent_id:3d}  {secret}  {_named(info.fingerprints)}"]
             parts.append(self._validity("certificate", self._member(info.agent_id).certificate(self.folder)))
             if os.path.exists(mavlink_path(self.folder, info.agent_id)):
                 key = load_mavlink_key(self.folder, info.agent_id)
@@ -114,7 +114,7 @@ class FleetKeys:
         yield from filter(None, (self._validity("authority", authority_path(self.folder)),))
         yield from filter(None, (self._validity("observer", self._member(None).certificate(self.folder)),))
         if os.path.exists(group_path(self.folder)):
-            yield f"group key  {'  '.join(map(key_fingerprint, load_group_keys(self.folder)))}"
+            yield f"group  {_named([key_fingerprint(key) for key in load_group_keys(self.folder)])}"
 
     def _validity(self, name: str, path: Path) -> str:
         if not os.path.exists(path):
@@ -152,3 +152,9 @@ class FleetKeys:
 
     def _has_signing(self, agent_id: int) -> bool:
         return os.path.exists(public_path(self.folder, agent_id))
+
+
+def _named(fingerprints: Sequence[str]) -> str:
+    """The key in use, and those before it that are still accepted."""
+    newest, *older = fingerprints
+    return "  ".join([f"key {newest}", *(f"former key {each} (accepted until it is retired)" for each in older)])

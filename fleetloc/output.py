@@ -14,14 +14,37 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from fleetloc.verbosity import stderr_console
+
 
 @contextmanager
 def progress_bar(what: str, total: int) -> Iterator[Callable[[], None]]:
-    """A bar on stderr while the block runs; gives the function that advances it by one."""
+    """A bar on stderr while the block runs; gives the function that advances it by one.
+
+    Where stderr is no terminal, a line for every tenth instead; with --quiet nothing.
+    """
+    console = stderr_console()
+    if not console.is_terminal:
+        yield _lines(console, what, total)
+        return
     columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=Console(stderr=True), transient=True) as bar:
+    with Progress(*columns, console=console, transient=True) as bar:
         task = bar.add_task(what, total=total)
         yield lambda: bar.advance(task)
+
+
+def _lines(console: Console, what: str, total: int) -> Callable[[], None]:
+    done, told = 0, 0
+
+    def advance() -> None:
+        nonlocal done, told
+        done += 1
+        tenth = 10 * done // max(total, 1)
+        if tenth > told and done <= total:
+            told = tenth
+            console.print(f"fleetloc: {what}: {done} of {total}", markup=False, soft_wrap=True)
+
+    return advance
 
 
 def print_table(columns: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> None:
@@ -42,7 +65,10 @@ def with_error(value: float, error: float, digits: int = 3) -> str:
 
 
 def write_json(path: Path, content: Any) -> None:
-    """Write machine-readable results; what is not a number becomes null, as JSON has no NaN."""
+    """Write machine-readable results, ``-`` to stdout; what is not a number becomes null, as JSON has no NaN."""
+    if str(path) == "-":
+        sys.stdout.write(json.dumps(_finite(content), indent=2) + "\n")
+        return
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_text(json.dumps(_finite(content), indent=2) + "\n", encoding="utf-8")
 

@@ -8,6 +8,7 @@ from rich.status import Status
 
 from estimators.compiled import entries as compiled
 from estimators.compiled.cache import cache_folder
+from fleetloc.verbosity import stderr_console
 
 
 class Announcer:
@@ -17,7 +18,7 @@ class Announcer:
     """
 
     def __init__(self, console: Console | None = None) -> None:
-        self._console = Console(stderr=True, highlight=False) if console is None else console
+        self._console = stderr_console() if console is None else console
         self._status: Status | None = None
         self._said: set[str] = set()
 

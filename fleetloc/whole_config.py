@@ -35,8 +35,8 @@ def whole(config: FleetConfig) -> FleetConfig:
 
 
 def read_whole(document: Document) -> tuple[FleetConfig | None, list[ConfigError]]:
-    """The same of a document, with everything that is wrong in any table: then there is no configuration."""
+    """The same of a document, as far as it can be read, and everything that is wrong in any table."""
     config, errors = read(document)
     for table in OTHER_TABLES.values():
         errors += table.read(document, config)[1]
-    return (None, errors) if errors or config is None else (whole(config), [])
+    return (config, errors) if errors or config is None else (whole(config), [])

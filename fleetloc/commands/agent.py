@@ -7,8 +7,9 @@ from typing import Annotated
 
 import typer
 
+from fleetloc.common_options import Quiet, Verbose
 from fleetloc.errors import FleetlocError
-from fleetloc.options import FleetFile, Overrides, Profiles
+from fleetloc.options import FleetFile, Overrides, Profiles, with_options
 
 
 class NotStarted(FleetlocError):
@@ -32,12 +33,12 @@ def agent(
     out: Annotated[
         Path | None, typer.Option("--out", help="Write the record here; earlier ones are kept beside it.")
     ] = None,
-    verbose: Annotated[int, typer.Option("--verbose", "-v", count=True, help="Say more on stderr.")] = 0,
-    quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Say faults only.")] = False,
+    verbose: Verbose = 0,
+    quiet: Quiet = False,
 ) -> None:
     """Run the daemon of one drone until SIGTERM or SIGINT.
 
-    Exit codes: 0 stopped, 1 a fault of the program, 2 wrong usage, 3 configuration, 4 autopilot's link, 5 keys,
+    Exit codes: 0 stopped, 1 a fault of the program, 2 wrong usage or configuration, 4 autopilot's link, 5 keys,
     6 session with the other agents, 7 no autopilot appeared, 8 record, 9 what has to outlive a restart (disk full).
     """
     import logging
@@ -55,21 +56,19 @@ def agent(
     from fleetloc.warmup import announce
     from transport.errors import KeyFileError
 
-    settings = list(overrides or ())
-    if out is not None:
-        settings.append(f"record.directory={out}")
+    settings = with_options([("--out", "record.directory", None if out is None else str(out))], overrides)
     try:
         fleet = load_config(config, settings, profiles or ())
         unset = require_epoch(fleet.fleet, str(config), unix_s=time.time())
     except ConfigError as error:
-        raise NotStarted(str(error), ExitCode.CONFIG) from error
+        raise NotStarted(str(error), ExitCode.BAD_INPUT) from error
     try:
         configure_logging(0 if quiet else 1 + verbose, log_file(fleet.log, agent_id))
         observers = observers_of(fleet, agent_id, config.parent) if agent_id in fleet.ids else []
     except RecordError as error:
         raise NotStarted(str(error), ExitCode.RECORD) from error
     except ConfigError as error:
-        raise NotStarted(str(error), ExitCode.CONFIG) from error
+        raise NotStarted(str(error), ExitCode.BAD_INPUT) from error
     except KeyFileError as error:
         raise NotStarted(str(error), ExitCode.KEYS) from error
     if unset is not None:

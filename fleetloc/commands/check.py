@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetloc.options import Overrides, Profiles
+from fleetloc.errors import BAD_INPUT
+from fleetloc.options import FleetFile, Overrides, Profiles
+
+if TYPE_CHECKING:
+    from agent.config.tables import FleetConfig
 
 
 def register(app: typer.Typer) -> None:
@@ -16,7 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 def check(
-    config: Annotated[Path, typer.Argument(help="Configuration of a fleet (TOML).")],
+    config: FleetFile,
     profiles: Profiles = None,
     overrides: Overrides = None,
     agent_id: Annotated[
@@ -25,40 +29,43 @@ def check(
     show: Annotated[
         bool, typer.Option("--print", help="Print the effective configuration, defaults filled in.")
     ] = False,
+    json_file: Annotated[
+        Path | None, typer.Option("--json", help="Write mistakes and warnings here; - is the terminal.")
+    ] = None,
 ) -> None:
     """Check a configuration, its simulated scenario and its security profile; starts nothing and opens nothing.
 
+    All mistakes are told at once, each with its file and line; warnings are about what is right and seldom meant.
     On the ground, where the authority's key is, the keys of every agent are checked, elsewhere those that are here.
     """
     import time
 
-    from agent.config.reading import dump
-    from agent.radio.security import agents_here, expiry_warnings, security_faults, state_warnings
-    from agent.sensing.clock import require_epoch
+    from agent.config.reading import dump, load_document
+    from fleetloc.config_check import check_document
     from fleetloc.errors import InputError
-    from fleetloc.whole_config import load_whole
-    from sim_bridge.world.scenario_config import scenario_from_config
+    from fleetloc.output import write_json
 
-    fleet = load_whole(config, overrides or (), profiles or ())
-    scenario_from_config(fleet)
+    document = load_document(config, overrides or (), profiles or ())
+    checked = check_document(document, config.parent, agent_id, unix_s=time.time(), keys=not show)
+    fleet = checked.config
+    if agent_id is not None and fleet is not None and agent_id not in fleet.ids:
+        raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
+    if json_file is not None:
+        write_json(json_file, checked.as_dict())
+    for error in checked.mistakes:
+        typer.echo(f"fleetloc: error: {error}", err=True)
+    for line in checked.warnings:
+        typer.echo(f"warning: {line}", err=True)
+    if checked.mistakes:
+        raise typer.Exit(BAD_INPUT)
+    assert fleet is not None
     if show:
         typer.echo(dump(fleet), nl=False)
-        return
-    if agent_id is not None and agent_id not in fleet.ids:
-        raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
-    base, unix_s = config.parent, time.time()
-    warnings = [line for line in (require_epoch(fleet.fleet, str(config), unix_s=unix_s),) if line is not None]
-    here = (agent_id,) if agent_id is not None else agents_here(fleet, base)
-    faults = dict.fromkeys(line for one in here for line in security_faults(fleet, one, base, unix_s=unix_s))
-    if faults:
-        for line in faults:
-            typer.echo(line, err=True)
-        expected = f"all that profile {fleet.security.profile} promises"
-        raise InputError(str(config), "security", expected, f"{len(faults)} things missing, see above")
-    for one in here:
-        warnings += expiry_warnings(fleet, one, base, unix_s=unix_s)
-    for line in dict.fromkeys([*warnings, *state_warnings(fleet, base)]):
-        typer.echo(f"warning: {line}", err=True)
+    elif json_file is None or str(json_file) != "-":
+        _summary(config, fleet)
+
+
+def _summary(config: Path, fleet: FleetConfig) -> None:
     typer.echo(f"{config}: fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
     for table in fleet.agents:
         hears = ", ".join(map(str, fleet.neighbours(table.id))) or "nobody"

@@ -25,7 +25,9 @@ def estimate(
     overrides: Annotated[
         list[str] | None, typer.Option("--set", help="estimator.KEY=VALUE, beats the file; may be repeated.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", help="Write mean, cov_diag and status here (.npz).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="FILE", help="Write mean, cov_diag and status here (.npz).")
+    ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Run one estimator per agent over a recording, in lockstep, and print the errors where it holds the truth."""

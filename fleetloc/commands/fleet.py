@@ -9,9 +9,10 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetloc.errors import INTERRUPTED, InputError
-from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles, with_options
 
 if TYPE_CHECKING:
+    from agent.config.documents import Override
     from agent.config.tables import FleetConfig
     from fleetloc.run.fleet_run import Outcome
 
@@ -54,15 +55,14 @@ def fleet(
     if demo:
         out = out or Path(DEMO_FOLDER)
     config = _chosen(config, demo)
-    options: dict[str, float | int | None] = {
-        "sim.duration_s": duration_s,
-        "sim.seed": seed,
-        "transport.seed": seed,
-        "transport.loss": loss,
-        "transport.delay_s": delay_s,
-    }
-    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
-    fleet_config = _prepared(config, profiles or [], [*settings, *(overrides or ())], out, live=not lockstep)
+    options = [
+        ("--duration", "sim.duration_s", duration_s),
+        ("--seed", "sim.seed", seed),
+        ("--seed", "transport.seed", seed),
+        ("--loss", "transport.loss", loss),
+        ("--delay", "transport.delay_s", delay_s),
+    ]
+    fleet_config = _prepared(config, profiles or [], with_options(options, overrides), out, live=not lockstep)
     folder = Path(str(fleet_config.record.directory))
     announce()
     warm_up_everything()
@@ -92,7 +92,7 @@ def _chosen(config: Path | None, demo: bool) -> Path:
 
 
 def _prepared(
-    config: Path, profiles: list[Path], settings: list[str], out: Path | None, *, live: bool
+    config: Path, profiles: list[Path], settings: list[Override], out: Path | None, *, live: bool
 ) -> FleetConfig:
     """The effective configuration, also written into the run's folder for all its processes.
 
@@ -122,11 +122,10 @@ def _prepared(
 def _fly(config: FleetConfig, folder: Path) -> Outcome:
     import asyncio
 
-    from rich.console import Console
-
     from fleetloc.run.fleet_run import FleetRun
+    from fleetloc.verbosity import stderr_console
 
     async def fly() -> Outcome:
-        return await FleetRun(config, folder, Console(stderr=True)).fly()
+        return await FleetRun(config, folder, stderr_console()).fly()
 
     return asyncio.run(fly())

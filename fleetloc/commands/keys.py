@@ -70,15 +70,28 @@ def rotate(
     """
     keys = _keys(config, agent_id, days=days)
     _one_of(agent_id is not None, group, observer)
+    export, retire = f"fleetloc keys export {config}", f"fleetloc keys retire {config}"
     if group:
         keys.rotate_group()
+        then = f"`{export} --id ID --out FOLDER` for every drone, restart their daemons, then `{retire} --group`"
     elif observer:
         keys.certify(None)
+        then = f"`{export} --observer --out FOLDER` for whoever listens"
     elif agent_id is not None and mavlink:
         keys.rotate_mavlink(agent_id)
-    elif agent_id is not None:
+        then = (
+            f"`fleetloc keys passphrase {config} --id {agent_id}` for its autopilot, "
+            f"`{export} --id {agent_id} --out FOLDER` for its drone, restart its daemon"
+        )
+    else:
+        assert agent_id is not None
         keys.rotate(agent_id)
+        then = (
+            f"`{export} --id ID --out FOLDER` for drone {agent_id} and for all that hear it, restart their daemons, "
+            f"then `{retire} --id {agent_id}`"
+        )
     _print(keys)
+    typer.echo(f"next: {then}", err=True)
 
 
 def retire(config: Config, agent_id: OptionalId = None, group: Group = False) -> None:

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetloc.options import Delay, FiguresFile, Loss, Overrides
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides, with_options
+
+if TYPE_CHECKING:
+    from agent.config.documents import Override
 
 
 def register(app: typer.Typer) -> None:
@@ -71,13 +74,13 @@ def replay(
     began_s = time.monotonic()
     truth_given = truth
     logs, truth = split_truth(logs, truth or ())
-    options: dict[str, object] = {
-        "estimator.kind": estimator,
-        "transport.loss": loss,
-        "transport.delay_s": delay_s,
-        "transport.seed": seed,
-    }
-    settings = [f"{key}={value}" for key, value in options.items() if value is not None] + list(overrides or ())
+    options = [
+        ("--estimator", "estimator.kind", estimator),
+        ("--loss", "transport.loss", loss),
+        ("--delay", "transport.delay_s", delay_s),
+        ("--seed", "transport.seed", seed),
+    ]
+    settings = with_options(options, overrides)
     folder = out or Path("out") / "replay"
     if any(path.suffix == ".mcap" for path in logs):
         given = {"--ranges": ranges_from, "--truth": truth_given, "--drop-gps": drop_gps, "--loss": loss,
@@ -115,7 +118,7 @@ def replay(
 
 
 def _repeat(
-    config: Path, logs: list[Path], refused: list[str], settings: list[str], folder: Path, json_file: Path | None
+    config: Path, logs: list[Path], refused: list[str], settings: list[Override], folder: Path, json_file: Path | None
 ) -> None:
     from fleetloc.errors import FAILED, InputError
     from fleetloc.run.replay_records import RECORDED, refuse_mixture, replay_records

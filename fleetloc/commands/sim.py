@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from fleetloc.options import FleetFile, Overrides, Profiles
+from fleetloc.options import FleetFile, Overrides, Profiles, with_options
 
 
 def register(app: typer.Typer) -> None:
@@ -36,10 +36,8 @@ def sim(
     from fleetloc.run.run_files import SIMULATOR_JSON, TRUTH
     from sim_bridge.world.simulator import simulate
 
-    settings = list(overrides or ())
-    settings += [] if seed is None else [f"sim.seed={seed}"]
-    settings += [] if duration_s is None else [f"sim.duration_s={duration_s}"]
-    fleet = load_config(config, settings, profiles or ())
+    options = [("--seed", "sim.seed", seed), ("--duration", "sim.duration_s", duration_s)]
+    fleet = load_config(config, with_options(options, overrides), profiles or ())
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
     report = asyncio.run(

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetloc.errors import FAILED, INTERRUPTED, InputError
-from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides
+from fleetloc.options import Delay, FiguresFile, FleetFile, Loss, Overrides, Profiles, with_options
 
 if TYPE_CHECKING:
     from agent.config.tables import FleetConfig
@@ -42,6 +42,7 @@ def sitl(
     delay_s: Delay = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>.")] = None,
     json_file: FiguresFile = None,
+    profiles: Profiles = None,
     overrides: Overrides = None,
 ) -> None:
     """Attach a daemon to each running simulator, range by its ground truth, fly a mission if asked, and report.
@@ -51,19 +52,20 @@ def sitl(
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files
     from fleetloc.warmup import announce, warm_up_everything
+    from fleetloc.whole_config import load_whole
     from sim_bridge.sitl.sitl_table import sitl_table
     from sim_bridge.world.sim_table import sim_table
 
-    options: dict[str, float | int | None] = {
-        "sim.duration_s": duration_s,
-        "sim.seed": seed,
-        "transport.seed": seed,
-        "transport.loss": loss,
-        "transport.delay_s": delay_s,
-    }
-    settings = [f"{key}={value}" for key, value in options.items() if value is not None]
-    fleet = _prepared(config, [*settings, *(overrides or ())], mission, drop_gps or [], duration_s)
-    folder = _write_folder(config, fleet, out)
+    options = [
+        ("--duration", "sim.duration_s", duration_s),
+        ("--seed", "sim.seed", seed),
+        ("--seed", "transport.seed", seed),
+        ("--loss", "transport.loss", loss),
+        ("--delay", "transport.delay_s", delay_s),
+    ]
+    loaded = load_whole(config, with_options(options, overrides), profiles or ())
+    fleet = _prepared(config, loaded, mission, drop_gps or [], duration_s)
+    folder = _write_folder((config, *(profiles or ())), fleet, out)
     announce()
     warm_up_everything()
     without_end = duration_s is None and sitl_table(fleet).mission is None
@@ -78,21 +80,19 @@ def sitl(
 
 
 def _prepared(
-    file: Path, settings: list[str], mission: str | None, drop_gps: list[str], duration_s: float | None
+    file: Path, fleet: FleetConfig, mission: str | None, drop_gps: list[str], duration_s: float | None
 ) -> FleetConfig:
     """The effective configuration, checked as far as that is possible before anything is started."""
     import msgspec
 
     from agent.config.reading import with_other_table
     from fleetloc.run.gps_drops import gps_outage
-    from fleetloc.whole_config import load_whole
     from sim_bridge.sitl.mission import load_mission
     from sim_bridge.sitl.pilot import require_client
     from sim_bridge.sitl.setup import vehicle_links
     from sim_bridge.sitl.sitl_table import sitl_table
     from sim_bridge.world.sim_table import sim_table
 
-    fleet = load_whole(file, settings)
     vehicle_links(fleet)
     replace = msgspec.structs.replace
     sitl, sim = sitl_table(fleet), sim_table(fleet)
@@ -108,7 +108,7 @@ def _prepared(
     return with_other_table(fleet, "sim", replace(sim, gps_outages=sim.gps_outages + outages))
 
 
-def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
+def _write_folder(files: tuple[Path, ...], fleet: FleetConfig, out: Path | None) -> Path:
     """Put the effective configuration into the run's folder, for all processes of the run; that folder."""
     import time
 
@@ -121,14 +121,14 @@ def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
 
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     mission = sitl_table(fleet).mission
-    run_files.refuse_inputs(folder, (file, *([mission] if mission is not None else [])))
-    require_epoch(fleet.fleet, str(file), unix_s=time.time())
-    keys = key_folder(fleet, file.parent)
+    run_files.refuse_inputs(folder, (*files, *([mission] if mission is not None else [])))
+    require_epoch(fleet.fleet, str(files[0]), unix_s=time.time())
+    keys = key_folder(fleet, files[0].parent)
     if fleet.security.mode == "signed":
         load_trust(keys, fleet.ids)
         for agent_id in fleet.ids:
             load_secret(keys, agent_id)
-    fleet = run_files.in_folder(fleet, file.parent, folder)
+    fleet = run_files.in_folder(fleet, files[0].parent, folder)
     run_files.clear(folder)
     (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
     return folder
@@ -137,15 +137,14 @@ def _write_folder(file: Path, fleet: FleetConfig, out: Path | None) -> Path:
 def _fly(folder: Path, duration_s: float | None) -> tuple[FleetConfig, SitlRun]:
     import asyncio
 
-    from rich.console import Console
-
     from agent.config.reading import load_config
     from fleetloc.run import run_files
     from fleetloc.run.sitl_run import SitlRun
+    from fleetloc.verbosity import stderr_console
 
     async def fly() -> tuple[FleetConfig, SitlRun]:
         fleet = load_config(folder / run_files.CONFIG)
-        run = SitlRun(fleet, folder, Console(stderr=True), duration_s)
+        run = SitlRun(fleet, folder, stderr_console(), duration_s)
         await run.fly()
         return fleet, run
 

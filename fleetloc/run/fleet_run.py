@@ -159,7 +159,7 @@ class FleetRun:
         for daemon in self._daemons.values():
             process = daemon.process
             if process is not None and process.returncode is not None:
-                code = BAD_INPUT if process.returncode == ExitCode.CONFIG else REFUSED
+                code = BAD_INPUT if process.returncode == ExitCode.BAD_INPUT else REFUSED
                 raise RunFailed(f"{daemon.name} {daemon.why_it_ended()}", code)
 
     async def _change(self, timeout_s: float) -> None:

@@ -30,7 +30,7 @@ def expect_exit(
 
 def test_an_unknown_id_is_a_configuration_error(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
     code, line = expect_exit(config_of(2), 7, caplog)
-    assert code is ExitCode.CONFIG
+    assert code is ExitCode.BAD_INPUT
     assert "expected one of 1, 2, found 7" in line
 
 

@@ -58,7 +58,7 @@ def test_a_missing_file_names_it(capsys: pytest.CaptureFixture[str]) -> None:
     assert code == BAD_INPUT
     assert "nowhere.toml" in line
     code, line = refused(capsys, "agent", "nowhere.toml", "--id", "1")
-    assert code == ExitCode.CONFIG
+    assert code == ExitCode.BAD_INPUT
 
 
 @pytest.mark.slow

@@ -55,7 +55,7 @@ def test_the_unit_gives_up_only_where_another_start_cannot_help() -> None:
     unit = (Path(__file__).parents[3] / "deploy" / "systemd" / "fleetloc@.service").read_text()
     (codes,) = (line for line in unit.splitlines() if line.startswith("RestartPreventExitStatus="))
     final = {ExitCode(int(code)) for code in codes.partition("=")[2].split()}
-    assert final == {ExitCode.USAGE, ExitCode.CONFIG, ExitCode.KEYS}
+    assert final == {ExitCode.BAD_INPUT, ExitCode.KEYS}
     assert "Restart=always" in unit
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import re
 import subprocess
 import sys
 from collections.abc import Callable
@@ -10,11 +11,15 @@ from pathlib import Path
 
 import pytest
 import typer
+from typer.core import TyperGroup
+from typer.main import get_command
 
 import fleetloc
 from fleetloc import cli
 from fleetloc.commands import warmup as commands_warmup
 from fleetloc.errors import EnvironmentFault, FleetlocError, InputError
+from fleetloc.output import progress_bar
+from fleetloc.verbosity import set_verbosity
 
 Run = Callable[[], int]
 
@@ -131,3 +136,57 @@ def test_start_imports_nothing_heavy() -> None:
     root = Path(__file__).parents[3]
     done = subprocess.run([sys.executable, "-c", look], capture_output=True, text=True, check=True, cwd=root)
     assert done.stdout == "[]\n"
+
+
+def commands() -> list[list[str]]:
+    """Every command of the command line, as it is typed."""
+    group = get_command(cli.build_app())
+    assert isinstance(group, TyperGroup)
+    found = []
+    for name, command in group.commands.items():
+        inner = command.commands if isinstance(command, TyperGroup) else None
+        found += [[name]] if inner is None else [[name, each] for each in inner]
+    return found
+
+
+@pytest.mark.parametrize("command", commands(), ids=" ".join)
+def test_every_command_has_the_same_help(command: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*command, "-h"]) == 0
+    text = capsys.readouterr().out
+    assert text.startswith(f"Usage: fleetloc {' '.join(command)} [OPTIONS]")
+    for option in ("-h, --help", "-v, --verbose", "-q, --quiet"):
+        assert option in text
+    assert not re.search(r"<(?!fleet>)\w+(\[\w+\])?>", text)
+    assert "{" not in text.splitlines()[0]
+
+
+def test_help_says_what_a_value_is(capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main(["fleet", "--help"]) == 0
+    text = capsys.readouterr().out
+    for words in ("--with FILE", "--set KEY=VALUE", "--duration S", "--out FOLDER", "--seed N"):
+        assert words in text
+
+
+def test_a_shell_is_told_how_to_complete(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -> None:
+    assert cli.main(["--help"]) == 0
+    assert "--install-completion" in capsys.readouterr().out
+    monkeypatch.setenv("_FLEETLOC_COMPLETE", "complete_bash")
+    monkeypatch.setenv("COMP_WORDS", "fleetloc che")
+    monkeypatch.setenv("COMP_CWORD", "1")
+    with pytest.raises(SystemExit):
+        cli.main([])
+    assert capsys.readouterr().out.strip() == "check"
+
+
+@pytest.mark.parametrize(("option", "lines"), [(None, 10), ("-q", 0)])
+def test_progress_without_a_terminal_is_a_line_now_and_then(
+    capsys: pytest.CaptureFixture[str], option: str | None, lines: int
+) -> None:
+    set_verbosity(-1 if option else 0)
+    with progress_bar("simulated seconds", 25) as advance:
+        for _ in range(25):
+            advance()
+    set_verbosity(0)
+    told = capsys.readouterr().err.splitlines()
+    assert len(told) == lines
+    assert told[-1:] == ["fleetloc: simulated seconds: 25 of 25"][: len(told)]

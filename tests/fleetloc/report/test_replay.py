@@ -201,7 +201,7 @@ def _flipped(raw: bytes, share: float) -> bytes:
         (None, ("--from", "1e6"), "--from/--to"),
         (None, ("--ranges", "synthetic:sigma=1"), "--ranges synthetic: expected"),
         (None, ("--arrival", "never"), "--arrival: expected logged or stamped"),
-        (None, ("--estimator", "magic"), "estimator.kind: expected one of"),
+        (None, ("--estimator", "magic"), "--estimator: expected one of"),
         (None, ("--truth", "a.csv", "b.csv"), "--truth: expected auto, or a file for each of 1"),
     ],
 )

@@ -1,0 +1,89 @@
+"""What every command has without saying so: -h, -q, -v, and a help in words instead of types."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import re
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, get_args, get_type_hints
+
+import typer
+from typer.core import TyperArgument, TyperCommand, TyperOption
+
+from fleetloc.verbosity import set_verbosity
+
+Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Say more on stderr.")]
+Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say on stderr what is wrong, nothing else.")]
+ARGUMENT_TYPE = re.compile(r"(?<=[A-Z]) <[^ >|]+>(?= )")
+BY_NAME = {"--out": "FOLDER", "--duration": "S", "--timeout": "S", "--wait": "S", "--from": "S", "--to": "S"}
+PLACEHOLDERS: dict[Any, str] = {int: "N", float: "NUMBER", Path: "FILE", str: "TEXT"}
+"""What stands for a value in help, by its type, where the option says nothing better."""
+
+
+class PlainCommand(TyperCommand):
+    """A command whose help shows ``CONFIG`` and ``FILE`` where typer would show ``{config}`` and ``<list[Path]>``."""
+
+    def __init__(self, *arguments: Any, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        for parameter in self.params:
+            if isinstance(parameter, TyperArgument) and parameter.metavar is None:
+                parameter.metavar = str(parameter.name).upper()
+            elif isinstance(parameter, TyperOption) and parameter.metavar is None and _takes_a_value(parameter):
+                parameter.metavar = _placeholder(parameter)
+
+    def get_help(self, ctx: Any) -> str:
+        """The help; a type behind an argument gives way to blanks, so that the columns stand."""
+        return ARGUMENT_TYPE.sub(lambda found: " " * len(found.group()), super().get_help(ctx))
+
+    def collect_usage_pieces(self, ctx: Any) -> list[str]:
+        """The words of the usage line, braces of required arguments left out."""
+        return [piece.replace("{", "").replace("}", "") for piece in super().collect_usage_pieces(ctx)]
+
+
+def complete(app: typer.Typer) -> None:
+    """Give every command of an application, and of the groups in it, what all of them have."""
+    for info in app.registered_commands:
+        info.cls = PlainCommand
+        if info.callback is not None:
+            info.callback = _with_verbosity(info.callback)
+    for group in app.registered_groups:
+        if group.typer_instance is not None:
+            complete(group.typer_instance)
+
+
+def _with_verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
+    """The same command with -v and -q, which it may take itself."""
+    signature, hints = inspect.signature(command), get_type_hints(command, include_extras=True)
+    own = signature.parameters.keys()
+
+    @functools.wraps(command)
+    def run(**given: Any) -> Any:
+        set_verbosity(-1 if given["quiet"] else given["verbose"])
+        return command(**{name: value for name, value in given.items() if name in own})
+
+    parameters = [each.replace(annotation=hints.get(each.name, each.annotation)) for each in _all(signature)]
+    run.__dict__.pop("__wrapped__")
+    run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
+    run.__annotations__ = {each.name: each.annotation for each in parameters}
+    return run
+
+
+def _all(signature: inspect.Signature) -> Iterator[inspect.Parameter]:
+    yield from signature.parameters.values()
+    for name, annotation, default in (("verbose", Verbose, 0), ("quiet", Quiet, False)):
+        if name not in signature.parameters:
+            yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+
+def _takes_a_value(option: TyperOption) -> bool:
+    return not (option.is_flag or option.count) and not option.type_descriptor.is_choice
+
+
+def _placeholder(option: TyperOption) -> str:
+    named = next((BY_NAME[name] for name in option.opts if name in BY_NAME), None)
+    if named is not None:
+        return named
+    kind = option.type_descriptor.annotation
+    return PLACEHOLDERS.get(next(iter(get_args(kind)), kind), "VALUE")

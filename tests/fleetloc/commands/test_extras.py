@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from fleetloc import cli, extras
+from tests.support.logs import LOGS
 
 ROOT = Path(__file__).parents[3]
 LINE3 = ROOT / "configs" / "line3.toml"
@@ -42,6 +43,22 @@ def test_a_fleet_flies_without_the_plotting_library(tmp_path: Path, capsys: pyte
     assert "pip install &#x27;fleetloc[report]&#x27;" in html
     assert "<svg" not in html
     assert html.count("<tr>") == 1 + 3, "a heading and three drones"
+    assert (tmp_path / "report.json").stat().st_size > 1000
+
+
+@pytest.mark.usefixtures("no_plots")
+def test_a_flight_is_replayed_without_the_plotting_library(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """GIVEN no matplotlib WHEN a log is replayed THEN figures and tables are there, and it is said what is not."""
+    config = ROOT / "configs" / "single.toml"
+    assert cli.main(["replay", str(config), str(LOGS / "copter.tlog.gz"), "--out", str(tmp_path)]) == 0
+    said = [line for line in capsys.readouterr().out.splitlines() if "pip install" in line]
+    assert said == ["note: report.html has no plots: matplotlib is not installed (pip install 'fleetloc[report]')"]
+    html = (tmp_path / "report.html").read_text()
+    assert "pip install &#x27;fleetloc[report]&#x27;" in html
+    assert "<svg" not in html
+    assert "<h2>Errors</h2>" in html
     assert (tmp_path / "report.json").stat().st_size > 1000
 
 

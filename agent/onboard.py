@@ -33,7 +33,6 @@ from agent.watch.health import State
 from agent.watch.position_watch import clock_finding
 from transport.errors import EncodeError, Rejected
 from transport.messages.clock_body import ClockAnswer, decode_clock_question
-from transport.messages.information_body import Information
 from transport.messages.uwb_body import UwbFrame
 from transport.security.auth import Identity
 from transport.security.opening import Opener
@@ -90,7 +89,6 @@ class OnboardAgent:
             config.fleet.name, config.ids, identity.trust, own_id=agent_id, freshness_s=freshness_s
         )
         self.sealer = Sealer(config.fleet.name, agent_id, boot=identity.boot, signing=identity.signing)
-        self._double = {"auto": None, "float32": False, "float64": True}[config.transport.information_format]
         self.unsent: Counter[str] = Counter()
         self._told_state = LinkState.SEARCHING
         self._serve_s = -math.inf if linked else math.inf
@@ -259,9 +257,8 @@ class OnboardAgent:
 
     def _sealed(self, message: Message, t_ns: int) -> list[Output]:
         """A message in packets; one that does not fit into any is counted."""
-        double = self._double if isinstance(message, Information) else None
         try:
-            return [Send(tuple(self.sealer.seal(message, t_ns=t_ns, double=double)), message)]
+            return [Send(tuple(self.sealer.seal(message, t_ns=t_ns)), message)]
         except EncodeError as error:
             self.unsent[type(message).__name__] += 1
             return [NotSent(message, error)]

@@ -2,11 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Annotated
-
-import msgspec
-
-from agent.config.fields import NotNegative, Port, Table
+from agent.config.fields import Port, Table
 
 
 class MetricsTable(Table, frozen=True):
@@ -23,10 +19,6 @@ class LogTable(Table, frozen=True):
 
     directory: str | None = None
     """Folder for ``agent_001.log`` and so on, relative to the working folder; absent = stderr only."""
-    keep: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
-    """Files put aside that are kept."""
-    min_free_mb: NotNegative = 100.0
-    """With less left on the disk, files put aside are deleted, the oldest first, and then no more is written."""
 
 
 class AdsbTable(Table, frozen=True):
@@ -35,5 +27,3 @@ class AdsbTable(Table, frozen=True):
     address: str | None = None
     """MAVLink address of the ground station or of a router before it, e.g. ``udpout:192.168.7.1:14550``; absent =
     nothing is sent. Never an autopilot's: it would evade its own fleet."""
-    period_s: Annotated[float, msgspec.Meta(ge=0.2, le=10)] = 1.0
-    """Each neighbour is sent this often."""

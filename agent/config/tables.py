@@ -110,8 +110,6 @@ class SensorsTable(Table, frozen=True):
     """Hard bound of a range's noise; sets its variance (bound squared over 3) where present."""
     accel_sigma_mps2: Positive = 0.1
     """1-sigma per axis of the acceleration averaged over a tick."""
-    accel_gap_sigma_mps2: Positive = 1.1547
-    """1-sigma of the acceleration while no IMU sample came (uniform in +-2 m/s2)."""
     imu_max_gap_s: Positive = 0.05
     """A longer silence between IMU samples counts as a gap."""
     gravity_mps2: Positive | None = None
@@ -172,8 +170,6 @@ class TransportTable(Table, frozen=True):
     """Ticks of own records in each measurement packet, so that one packet repairs earlier losses."""
     neighbour_timeout_s: Positive = 2.0
     """A neighbour silent for longer is not waited for."""
-    information_format: Literal["auto", "float32", "float64"] = "auto"
-    """Precision of information pairs on the wire; auto = single where their conditioning allows."""
     loss: Fraction = 0.0
     """Injected after receive: probability that a packet is lost."""
     delay_s: NotNegative = 0.0

@@ -22,6 +22,7 @@ from estimators.estimator import Estimate
 ICAO_BASE = 0xF00000
 EMITTER_UAV = 14
 GEOMETRIC_ALTITUDE = 1
+PERIOD_S = 1.0
 MAX_AGE_S = 255.0
 MAX_SIGMA_M = 20.0
 """A neighbour that is known no better than this (largest axis, 1-sigma) is not shown."""
@@ -101,8 +102,8 @@ class AdsbReporter(Observer):
         await self._link.open()
 
     def on_estimate(self, ready: EstimateReady, published_s: float, tick_time_s: float) -> None:
-        if not self._next_s - self._config.adsb.period_s <= published_s < self._next_s:  # a clock set back sends
-            self._next_s = published_s + self._config.adsb.period_s
+        if not self._next_s - PERIOD_S <= published_s < self._next_s:  # a clock set back sends
+            self._next_s = published_s + PERIOD_S
             self._send(ready, published_s)
 
     def _send(self, ready: EstimateReady, published_s: float) -> None:

@@ -24,6 +24,8 @@ TICK_ROUNDING = 1e-6
 """Instants this share of a tick before a tick's start belong to it: k T is not exact in floating point."""
 KEEP_S = 1.0
 MAX_SAMPLES = 4096
+ACCEL_GAP_SIGMA_MPS2 = 1.1547
+"""1-sigma of the acceleration while no IMU sample came: uniform in +-2 m/s2, as of other drones by default."""
 ATTITUDE_MAX_AGE_S = 0.3
 """An IMU sample without an attitude this close is a gap: carried further with the turn rate, tilt errors show."""
 _Sample = TypeVar("_Sample", ImuSample, AttitudeSample)
@@ -87,11 +89,11 @@ class Timeline:
         self._forget(start_s - KEEP_S)
         inside = len([t for t, _ in points if start_s <= t < end_s])
         if covered_s <= 0.0:
-            spread = self._sensors.accel_gap_sigma_mps2**2 + self._sensors.accel_sigma_mps2**2
+            spread = ACCEL_GAP_SIGMA_MPS2**2 + self._sensors.accel_sigma_mps2**2
             return TickInput(tick, (0.0, 0.0, 0.0), (spread, spread, spread), 0.0, 0)
         coverage = min(covered_s / self._period_s, 1.0)
         uncovered = 1.0 - coverage if 1.0 - coverage > TICK_ROUNDING else 0.0
-        variance = self._sensors.accel_sigma_mps2**2 + (uncovered * self._sensors.accel_gap_sigma_mps2) ** 2
+        variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2
         north, east, down = (component / covered_s for component in integral)
         return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside)
 

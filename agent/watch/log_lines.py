@@ -15,6 +15,10 @@ from agent.log.disk import free_bytes
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
 LINE = "%(asctime)s %(levelname)s %(message)s"
 DISK_CHECK_PERIOD_S = 1.0
+KEEP = 5
+"""Files put aside that are kept."""
+MIN_FREE_BYTES = 100_000_000
+"""With less left on the disk, files put aside are deleted, the oldest first, and then no more is written."""
 MAX_BYTES = 10_000_000
 """A file that has grown to this is put aside as ``.1``, what was ``.1`` as ``.2``."""
 
@@ -38,7 +42,7 @@ def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_
     path = Path(table.directory) / f"agent_{agent_id:03d}.log"
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        limits = MAX_BYTES, table.keep, round(table.min_free_mb * 1e6)
+        limits = MAX_BYTES, KEEP, MIN_FREE_BYTES
         return LimitedLogFile(path, *limits, free)
     except OSError as error:
         raise RecordError(f"log {path}: cannot be written: {error.strerror or error}") from error
@@ -72,7 +76,7 @@ class LimitedLogFile(RotatingFileHandler):
             self.dropped += 1
             return
         if self.dropped:
-            lost = f"{self.dropped} lines lost: the disk had less than log.min_free_mb left"
+            lost = f"{self.dropped} lines lost: the disk was nearly full"
             self.dropped = 0
             super().emit(logging.LogRecord(record.name, logging.WARNING, "", 0, lost, None, None))
         super().emit(record)

@@ -17,7 +17,7 @@ from agent.mavlink.stream_rates import StreamRates
 from agent.mavlink.timesync import BootClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Triple
-from sim_bridge.sitl.sitl_table import sitl_table
+from sim_bridge.sitl.sitl_table import COMPONENT_ID
 from sim_bridge.sitl.truth import TRUTH_HZ, TRUTH_MESSAGES, TrueSample, TruthTap, boot_time_s
 
 HEARTBEAT_S = 1.0
@@ -41,8 +41,7 @@ class SitlSession:
         self._system = config.system_id(agent_id)
         self._wanted_flavour = config.agent(agent_id).autopilot
         self._settings = config.mavlink
-        sitl = sitl_table(config)
-        self._encoder = Encoder(self._system, sitl.component_id)
+        self._encoder = Encoder(self._system, COMPONENT_ID)
         self.decoder = Decoder(datagrams=datagrams)
         self.tap = TruthTap(FleetFrame.of(config))
         self.clock = BootClock(config.mavlink.max_rtt_s)

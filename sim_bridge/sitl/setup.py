@@ -5,11 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from agent.config.endpoints import SPELLINGS, Endpoint, LinkKind, parse_endpoint
+from agent.config.faults import Fault
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError, EndpointError
 from sim_bridge.sitl.sitl_table import sitl_table
 
-WHERE = "[sitl]"
 ARDUPILOT_TCP, ARDUPILOT_STEP = 5760, 10
 """Serial port 0 of ArduPilot's SITL listens here; each further instance ten ports higher."""
 PX4_UDP = 14540
@@ -42,23 +42,34 @@ def vehicle_links(config: FleetConfig) -> dict[int, VehicleLinks]:
     _check_height(config)
     links = {agent_id: _links(config, agent_id, number) for number, agent_id in enumerate(config.ids)}
     taken: dict[str, str] = {}
-    for link in links.values():
-        for what, address in (
-            (f"simulator of drone {link.agent_id}", f"{link.simulator.host}:{link.simulator.port}"),
-            (f"daemon of drone {link.agent_id}", f"{link.daemon.host}:{link.daemon.port}"),
-            (f"clients of drone {link.agent_id}", f"{LOCAL_HOST}:{link.client_port}"),
+    for index, link in enumerate(links.values()):
+        for key, what, address in (
+            (_simulator_key(config, link.agent_id), "simulator", f"{link.simulator.host}:{link.simulator.port}"),
+            (f"agents[{index}].mavlink", "daemon", f"{link.daemon.host}:{link.daemon.port}"),
+            ("sitl.client_port", "clients", f"{LOCAL_HOST}:{link.client_port}"),
         ):
+            who = f"{what} of drone {link.agent_id}"
             if address in taken:
-                raise ConfigError(WHERE, what, "an address of its own", f"{address}, that of the {taken[address]}")
-            taken[address] = what
+                expected = f"an address of its own for the {who}"
+                raise _error(config, key, expected, f"{address}, that of the {taken[address]}")
+            taken[address] = who
     return links
+
+
+def _error(config: FleetConfig, key: str, expected: str, found: str) -> ConfigError:
+    return config.others.document.error(Fault(key, expected, found))
+
+
+def _simulator_key(config: FleetConfig, agent_id: int) -> str:
+    agents = [vehicle.agent for vehicle in sitl_table(config).vehicles]
+    return f"sitl.vehicles[{agents.index(agent_id)}].simulator" if agent_id in agents else "sitl.vehicles"
 
 
 def _check_height(config: FleetConfig) -> None:
     """The simulators give heights above mean sea level only."""
     if config.fleet.origin.altitude == "ellipsoid" and config.sensors.geoid_separation_m is None:
         expected = "a geoid separation, since the origin's height is ellipsoidal and the simulators' truth is not"
-        raise ConfigError(WHERE, "sensors.geoid_separation_m", expected, "none")
+        raise _error(config, "sensors.geoid_separation_m", expected, "none")
 
 
 def _links(config: FleetConfig, agent_id: int, number: int) -> VehicleLinks:
@@ -66,14 +77,17 @@ def _links(config: FleetConfig, agent_id: int, number: int) -> VehicleLinks:
     if vehicle is None:
         simulator, gcs = _default_simulator(config, agent_id, number), None
     else:
-        simulator = _parsed(vehicle.simulator, f"simulator of agent {agent_id}")
-        gcs = None if vehicle.gcs is None else _parsed(vehicle.gcs, f"gcs of agent {agent_id}")
+        key = _simulator_key(config, agent_id)
+        simulator = _parsed(config, vehicle.simulator, key)
+        key = key.replace(".simulator", ".gcs")
+        gcs = None if vehicle.gcs is None else _parsed(config, vehicle.gcs, key)
         if gcs is not None and gcs.kind is not LinkKind.UDP_IN:
-            raise ConfigError(WHERE, f"gcs of agent {agent_id}", "udpin:HOST:PORT, a station that listens", str(gcs))
-    daemon = _parsed(config.agent(agent_id).mavlink, f"mavlink of agent {agent_id}")
+            raise _error(config, key, "udpin:HOST:PORT, a station that listens", str(gcs))
+    key = f"agents[{number}].mavlink"
+    daemon = _parsed(config, config.agent(agent_id).mavlink, key)
     if daemon.kind not in (LinkKind.UDP_IN, LinkKind.UDP_OUT):
         expected = "udpin:HOST:PORT or udpout:HOST:PORT for the daemon (a simulator's address goes to sitl.vehicles)"
-        raise ConfigError(WHERE, f"mavlink of agent {agent_id}", expected, str(daemon))
+        raise _error(config, key, expected, str(daemon))
     return VehicleLinks(agent_id, simulator, daemon, sitl_table(config).client_port + number, gcs)
 
 
@@ -83,12 +97,12 @@ def _default_simulator(config: FleetConfig, agent_id: int, number: int) -> Endpo
             return Endpoint(LinkKind.TCP_OUT, LOCAL_HOST, ARDUPILOT_TCP + ARDUPILOT_STEP * number)
         case "px4":
             return Endpoint(LinkKind.UDP_IN, LOCAL_HOST, PX4_UDP + number)
-    expected = "an entry in sitl.vehicles, or agents.autopilot px4 or ardupilot for its default port"
-    raise ConfigError(WHERE, f"simulator of agent {agent_id}", expected, "autopilot auto and no entry")
+    expected = f"an entry for agent {agent_id}, or its autopilot px4 or ardupilot for the default port"
+    raise _error(config, "sitl.vehicles", expected, "autopilot auto and no entry")
 
 
-def _parsed(text: str, key: str) -> Endpoint:
+def _parsed(config: FleetConfig, text: str, key: str) -> Endpoint:
     try:
         return parse_endpoint(text)
     except EndpointError as error:
-        raise ConfigError(WHERE, key, SPELLINGS, str(error)) from error
+        raise _error(config, key, SPELLINGS, str(error)) from error

@@ -17,6 +17,9 @@ from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
 from transport.link.addresses import MAX_PORT
 
+COMPONENT_ID = 194
+"""MAVLink component id of the bridge, another one than the daemon's, and none that MAVLink gives to others."""
+
 
 class SitlVehicleTable(Table, frozen=True):
     """``[[sitl.vehicles]]``: where the simulated autopilot of one agent is."""
@@ -36,8 +39,6 @@ class SitlTable(Table, frozen=True):
     ArduPilot ``tcp:127.0.0.1:5760 + 10 n``, PX4 ``udpin:127.0.0.1:14540 + n``."""
     client_port: Annotated[int, msgspec.Meta(ge=1024, le=64_000)] = 14_590
     """MAVSDK and ground stations reach agent number n (from 0) at UDP 127.0.0.1, this port + n."""
-    component_id: Annotated[int, msgspec.Meta(ge=2, le=255)] = 194
-    """MAVLink component id of the bridge; another one than the daemon's."""
     uwb_reach_m: Positive = 200.0
     """No ranges over longer distances."""
     appear_timeout_s: Positive = 60.0
@@ -59,9 +60,8 @@ def _faults(table: SitlTable, config: FleetConfig) -> Iterator[Fault]:
     last = table.client_port + len(config.ids) - 1
     if last > MAX_PORT:
         yield Fault("sitl.client_port", f"a port for each agent up to {MAX_PORT}", f"{last} for the last")
-    if table.component_id == config.mavlink.component_id:
-        expected = "another id than mavlink.component_id, the daemon's"
-        yield Fault("sitl.component_id", expected, f"{table.component_id} for both")
+    if config.mavlink.component_id == COMPONENT_ID:
+        yield Fault("mavlink.component_id", "another id than the bridge's", f"{COMPONENT_ID} for both")
 
 
 SITL = OtherTable("sitl", SitlTable, _faults)

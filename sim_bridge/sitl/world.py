@@ -70,9 +70,8 @@ class SitlWorld:
 
     def __init__(self, config: FleetConfig, unix_offset_s: float) -> None:
         """Raises `ScenarioError` for rates that cannot be had."""
-        sitl = sitl_table(config)
         self.scenario: Scenario = dataclasses.replace(
-            scenario_from_config(config), uwb_reach_m=sitl.uwb_reach_m
+            scenario_from_config(config), uwb_reach_m=sitl_table(config).uwb_reach_m
         )
         self.unix_offset_s = unix_offset_s
         self.tracks = {agent_id: VehicleTrack() for agent_id in config.ids}

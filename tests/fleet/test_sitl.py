@@ -162,7 +162,7 @@ def test_absent_simulators_end_in_one_line_with_their_addresses(sitl: Sitl) -> N
         (("--drop-gps", "7"), "--drop-gps: expected one of the ids 1, 2, 3, found 7"),
         (("--drop-gps", "2:-5,"), "--duration for times from the end"),
         (("--mission", "nowhere.toml"), "nowhere.toml: expected a readable mission"),
-        (("--set", "sitl.component_id=197"), "component_id"),
+        (("--set", "mavlink.component_id=194"), "component_id"),
     ],
 )
 def test_bad_input_is_one_line_and_starts_nothing(

@@ -53,13 +53,13 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         "agents.2.mavlink=udpin:127.0.0.1:24552",
         'agents.2.name="two = 2"',
         "record.directory=out",
-        "transport.information_format=float32",
+        "transport.link=multilink",
     ]
     config = load_config(LINE3, overrides)
     assert (config.estimator.window, config.estimator.kind) == (3, "dekf_ci")
     assert (config.agent(2).mavlink, config.agent(2).name) == ("udpin:127.0.0.1:24552", "two = 2")
     assert config.record.directory == "out"
-    assert config.transport.information_format == "float32"
+    assert config.transport.link == "multilink"
 
 
 @pytest.mark.parametrize(

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from agent.sensing.frames import from_euler, rotated
 from agent.sensing.samples import AttitudeSample, ImuSample, Quaternion
-from agent.sensing.timeline import MAX_SAMPLES, TickInput, Timeline, tick_of
+from agent.sensing.timeline import ACCEL_GAP_SIGMA_MPS2, MAX_SAMPLES, TickInput, Timeline, tick_of
 from tests.agent.conftest import fleet_config
 from tests.support.holding import held
 from tests.support.onboard import onboard_of
@@ -34,7 +34,7 @@ def force(attitude: Quaternion, accel: tuple[float, float, float]) -> tuple[floa
 
 
 def timeline(**sensors: float) -> Timeline:
-    given = {"accel_sigma_mps2": 0.1, "accel_gap_sigma_mps2": 2.0, **sensors}
+    given = {"accel_sigma_mps2": 0.1, **sensors}
     return onboard_of(fleet_config(1, *(f"sensors.{key}={value}" for key, value in given.items()))).core.timeline
 
 
@@ -126,7 +126,7 @@ def test_a_gap_is_not_bridged_and_inflates_the_variance() -> None:
     # The gap from 1.02 to 1.07 is longer than 0.02 s.
     assert closed.coverage == pytest.approx(0.5, abs=1e-6)
     assert closed.accel_mps2 == pytest.approx((1.0, -2.0, 0.5), abs=1e-9)
-    assert closed.variance == pytest.approx((0.1**2 + (0.5 * 2.0) ** 2,) * 3)
+    assert closed.variance == pytest.approx((0.1**2 + (0.5 * ACCEL_GAP_SIGMA_MPS2) ** 2,) * 3)
 
 
 def test_the_last_sample_holds_no_longer_than_a_gap() -> None:
@@ -138,7 +138,8 @@ def test_the_last_sample_holds_no_longer_than_a_gap() -> None:
 def test_without_samples_there_is_no_acceleration_but_a_variance() -> None:
     for made in (timeline(), timeline()):
         closed = made.close(10)
-        assert closed == TickInput(10, (0.0, 0.0, 0.0), (4.01, 4.01, 4.01), 0.0, 0)
+        without = ACCEL_GAP_SIGMA_MPS2**2 + 0.1**2
+        assert closed == TickInput(10, (0.0, 0.0, 0.0), (without, without, without), 0.0, 0)
 
 
 def test_without_attitude_imu_samples_are_worth_nothing() -> None:

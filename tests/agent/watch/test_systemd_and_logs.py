@@ -173,7 +173,7 @@ def test_a_disk_that_fills_up_costs_old_files_first_and_then_lines_that_are_coun
     line(handler, "fourth", 3.5)
     handler.close()
     assert (tmp_path / "a.log").read_text().splitlines() == [
-        "first", "2 lines lost: the disk had less than log.min_free_mb left", "fourth",
+        "first", "2 lines lost: the disk was nearly full", "fourth",
     ]  # fmt: skip
 
 

@@ -22,7 +22,7 @@ from sim_bridge.sitl.mission import MissionError, load_mission
 from sim_bridge.sitl.ports import packed
 from sim_bridge.sitl.session import SitlSession, TimedTruth
 from sim_bridge.sitl.setup import vehicle_links
-from sim_bridge.sitl.sitl_table import sitl_table
+from sim_bridge.sitl.sitl_table import COMPONENT_ID
 from sim_bridge.sitl.truth import TruthTap
 from sim_bridge.world.simulation import Simulation
 from tests.support.loopback_sitl import FRAME, grounded_fleet
@@ -195,7 +195,7 @@ def test_answers_to_the_daemon_are_not_taken_for_answers_to_the_bridge() -> None
     denied = mavlink.MAVLink_command_ack_message(511, 2, target_system=2, target_component=197)
     session.receive(bytes(denied.pack(ardupilot)), 10.1)
     assert session.refusal is None
-    denied.target_component = sitl_table(config).component_id
+    denied.target_component = COMPONENT_ID
     session.receive(bytes(denied.pack(ardupilot)), 10.2)
     assert "refuses SIM_STATE" in str(session.refusal)
 
@@ -235,9 +235,9 @@ def test_default_addresses_are_those_of_the_simulators() -> None:
     [
         ({"sitl": {"vehicles": [{"agent": 9, "simulator": "tcp:127.0.0.1:1"}]}}, "ids of agents"),
         ({"sitl": {"vehicles": [{"agent": 1, "simulator": "tcp:127.0.0.1:1"}] * 2}}, "one entry per agent"),
-        ({"sitl": {"vehicles": [{"agent": 1, "simulator": "nonsense"}]}}, "simulator of agent 1"),
+        ({"sitl": {"vehicles": [{"agent": 1, "simulator": "nonsense"}]}}, "sitl.vehicles of agent 1, simulator"),
         ({"sitl": {"vehicles": [{"agent": 1, "simulator": "tcp:127.0.0.1:14651"}]}}, "an address of its own"),
-        ({"sitl": {"component_id": 197}}, "another id than mavlink.component_id"),
+        ({"mavlink": {"component_id": 194}}, "another id than the bridge"),
         ({"agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:14651"}]}, "autopilot px4 or ardupilot"),
         ({"agents": [{"id": 1, "autopilot": "px4", "mavlink": "tcp:127.0.0.1:5760"}]}, "udpin:HOST:PORT or udpout"),
         (

@@ -9,13 +9,16 @@ import sys
 
 from fleetloc import shadowing
 
+REFUSED = 3
+"""As in `agent.exit_codes`, which cannot be imported before it is known whose ``agent`` that is."""
+
 
 def main() -> int:
     """Run the command that was typed; returns the exit code, see `fleetloc.errors`."""
     complaint = shadowing.complaint()
     if complaint is not None:
         print(f"fleetloc: error: {complaint}", file=sys.stderr)  # noqa: T201
-        return 3
+        return REFUSED
     from fleetloc import cli  # only now
 
     return cli.main()

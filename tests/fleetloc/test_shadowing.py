@@ -13,6 +13,7 @@ from pathlib import Path
 
 import pytest
 
+from agent.exit_codes import ExitCode
 from fleetloc import shadowing
 
 ROOT = Path(__file__).parents[2]
@@ -38,7 +39,7 @@ def package(folder: Path, name: str) -> Path:
 
 
 def one_line(done: subprocess.CompletedProcess[str]) -> str:
-    assert done.returncode == 3, done.stderr
+    assert done.returncode == ExitCode.REFUSED, done.stderr
     assert done.stdout == ""
     (line,) = done.stderr.splitlines()
     assert line.startswith("fleetloc: error: ")

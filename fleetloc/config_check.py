@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 from agent.config.documents import Document
-from agent.config.faults import Fault
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
 from agent.radio.security import agents_here, expiry_warnings, security_faults, state_warnings
@@ -78,10 +77,10 @@ def check_document(
 def _check_surroundings(checked: Checked, config: FleetConfig, document: Document, unix_s: float) -> None:
     """Of the clock, the simulated world and the simulators' addresses."""
     try:
-        unset = require_epoch(config.fleet, document.where, unix_s=unix_s)
+        unset = require_epoch(config, unix_s=unix_s)
         checked.warnings += [] if unset is None else [unset]
     except ConfigError as error:
-        checked.mistakes.append(document.error(Fault(error.key, error.expected, error.found)))
+        checked.mistakes.append(error)
     try:
         scenario_from_config(config)
     except ScenarioError as error:

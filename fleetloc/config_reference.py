@@ -17,18 +17,29 @@ from typing import Any, Literal
 
 import msgspec
 
+from agent.config.retired import RETIRED
 from agent.config.tables import FleetConfig
 from estimators.settings import DEFAULT_KIND, DEFAULTS_OF_KIND, EstimatorSettings
 from fleetloc.whole_config import OTHER_TABLES
 
 HEADER = """# Configuration reference
 
-One TOML file describes a fleet; every process of it reads the same file. Unknown keys are refused with file, key and
+One TOML file describes a fleet; every process of it reads the same file. Unknown keys are refused with file, line and
 what was expected. `--set key=value` on the command line beats the file (`--set estimator.window=8`,
 `--set agents.2.mavlink=udpin:127.0.0.1:14562`, where 2 is the agent's id). `fleetloc check CONFIG` reads it as the
 daemon would, `--print` shows what is in effect. A unit is in a key's name; NED metres, seconds, radians throughout.
 
 This page is generated from the code (`make docs`).
+"""
+OTHERS = """# Tables that no drone reads
+
+The simulator, `fleetloc sitl` and `fleetloc monitor` read them; a daemon carries them along unread, so that one file
+serves all, and `fleetloc check` checks them.
+"""
+FORMER = """# Former keys
+
+They are constants now; a file that has one is refused, and the line can go. A flight log that has one with this value
+replays as before.
 """
 NONE = type(None)
 
@@ -40,8 +51,15 @@ def reference() -> str:
         if field.name != "others":
             struct, is_array = _table_of(field.type)
             parts.append(_table(field.name, struct, is_array))
+    parts.append(OTHERS)
     parts += [_table(name, table.struct, False) for name, table in OTHER_TABLES.items()]
+    parts.append(_former_keys())
     return "\n".join(parts)
+
+
+def _former_keys() -> str:
+    rows = [f"| `{key}` | `{_toml(retired.value)}` | {retired.words} |" for key, retired in RETIRED.items()]
+    return "\n".join([FORMER, "| key | value | now |", "|---|---|---|", *rows, ""])
 
 
 def _table(name: str, struct: type, is_array: bool) -> str:
@@ -168,7 +186,7 @@ def _type(kind: Any) -> str:
 def _limits(meta: msgspec.Meta) -> list[str]:
     signs = {"gt": "&gt;", "ge": "≥", "lt": "&lt;", "le": "≤"}
     limits = [f"{sign} {value:g}" for key, sign in signs.items() if (value := getattr(meta, key)) is not None]
-    return [*limits, *([f"matching `{meta.pattern}`"] if meta.pattern else [])]
+    return [*limits, *([f"of {meta.description}"] if meta.pattern and meta.description else [])]
 
 
 def _one_line(text: str) -> str:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 from typing import Any, Generic, TypeVar
 
@@ -25,6 +25,7 @@ from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
 from estimators.settings import EstimatorSettings, with_kind_defaults
 
+NO_FLEET = "there is no [fleet] and no [[agents]]; a profile is laid over a fleet's file by --with"
 T = TypeVar("T", bound=msgspec.Struct)
 
 
@@ -170,9 +171,25 @@ def _separately(document: Document) -> tuple[FleetConfig | None, list[Fault]]:
     unknown = [name for name in own if name not in known]
     faults = [Fault(name, one_of(known), "an unknown key", probably(name, known)) for name in unknown]
     config, more = read_struct({name: own[name] for name in own if name not in unknown}, FleetConfig)
+    if "fleet" not in own and "agents" not in own:
+        more = [Fault("fleet", "", "", says=NO_FLEET)]
     if config is None or faults:
-        return None, [*faults, *more]
+        return None, [*faults, *map(_in_its_table, more)]
     return msgspec.structs.replace(config, others=_others(document)), []
+
+
+def _in_its_table(fault: Fault) -> Fault:
+    """A fault of a key that no key of its table is like, naming the table that has one of that name."""
+    name = fault.key.partition(".")[2]
+    if fault.found != "an unknown key" or fault.meant or "." in name:
+        return fault
+    tables = {field.name: field.type for field in msgspec.structs.fields(FleetConfig)}
+    having = [each for each, kind in tables.items() if _is_table(kind) and name in keys_of(kind)]
+    return replace(fault, meant=f"{having[0]}.{name}") if len(having) == 1 else fault
+
+
+def _is_table(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, msgspec.Struct)
 
 
 def _others(document: Document) -> OtherTables:

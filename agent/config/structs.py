@@ -80,8 +80,15 @@ def _table_faults(value: Any, choices: list[type[msgspec.Struct]], key: str) -> 
         if field.encode_name in value:
             yield from _faults(value[field.encode_name], field.type, place)
         elif field.required:
-            table = _is_struct(_unwrapped(field.type)[0])
-            yield Fault(place, f"{'a table' if table else 'a value'} (it is required)", "nothing")
+            yield Fault(place, f"{_sort_of(field.type)} (it is required)", "nothing")
+
+
+def _sort_of(kind: Any) -> str:
+    """A value, a table or an array of tables."""
+    plain, _ = _unwrapped(kind)
+    if typing.get_origin(plain) is tuple and _is_struct(typing.get_args(plain)[0], deep=True):
+        return "an array of tables"
+    return "a table" if _is_struct(plain, deep=True) else "a value"
 
 
 def _array_faults(value: Any, kind: Any, metas: list[msgspec.Meta], key: str) -> Iterator[Fault]:

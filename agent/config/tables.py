@@ -22,8 +22,11 @@ class OriginTable(Table, frozen=True):
     """Geodetic origin of the fleet's NED frame."""
 
     lat_deg: Annotated[float, msgspec.Meta(ge=-90, le=90)]
+    """WGS84 latitude."""
     lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
+    """WGS84 longitude."""
     alt_m: Annotated[float, msgspec.Meta(ge=-500, le=20_000)]
+    """Its height, above what ``altitude`` says."""
     altitude: Literal["ellipsoid", "msl"] = "msl"
     """What ``alt_m`` and all heights of the fleet are above: the WGS84 ellipsoid or mean sea level."""
 
@@ -32,7 +35,9 @@ class FleetTable(Table, frozen=True):
     """``[fleet]``: what all agents agree on."""
 
     name: Name
+    """Stands in topics, keys and reports; another fleet on the same radio needs another one."""
     origin: OriginTable
+    """Where the fleet's NED frame has its zero; a replay takes it from the log where it is absent."""
     period_s: Annotated[float, msgspec.Meta(ge=0.02, le=10)] = 0.1
     """Length T of a tick."""
     epoch_unix_s: NotNegative = 1_767_225_600.0
@@ -50,11 +55,13 @@ class AgentTable(Table, frozen=True):
     """``[[agents]]``: one drone."""
 
     id: AgentId
+    """Of the drone, in packets, files and options."""
     mavlink: str
     """Address of the autopilot, e.g. ``udpin:127.0.0.1:14551`` or ``serial:/dev/ttyAMA0:921600``."""
     name: str = ""
     """For people only."""
     autopilot: Literal["px4", "ardupilot", "auto"] = "auto"
+    """What flies it; auto = seen from its heartbeat."""
     system_id: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None
     """MAVLink system id of the autopilot; absent = the agent's id (255 at most)."""
     radio: str | None = None
@@ -69,15 +76,20 @@ class MavlinkTable(Table, frozen=True):
     """``[mavlink]``: how the daemon behaves on the autopilot's link."""
 
     component_id: Annotated[int, msgspec.Meta(ge=2, le=255)] = 197
+    """MAVLink component id of the daemon."""
     imu_hz: Annotated[float, msgspec.Meta(ge=1, le=1000)] = 100.0
+    """Rate asked of the autopilot for acceleration and turn rate."""
     attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    """Rate asked of the autopilot for its attitude."""
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
+    """Rate asked of the autopilot for fixes."""
     max_rtt_s: Positive = 0.010
     """TIMESYNC exchanges slower than this (or twice the best) are not used."""
     appear_timeout_s: NotNegative = 60.0
     """The daemon gives up if no autopilot appears within this; 0 = it waits for ever. One that was there and
     disappears never stops it."""
     heartbeat_timeout_s: Positive = 3.0
+    """An autopilot silent for longer is lost."""
     end_after_lost_s: Positive | None = None
     """An autopilot lost for this long ends the daemon, its records closed: for simulated flights; absent = never."""
     signing: Literal["auto", "on", "off"] = "auto"
@@ -96,10 +108,12 @@ class SensorsTable(Table, frozen=True):
     gps_speed: Literal["horizontal", "norm", "off"] = "horizontal"
     """What GPS_RAW_INT.vel is: ground speed along cog (real receivers), or the velocity's norm (paper)."""
     gps_speed_half_width_mps: Positive | None = None
+    """Of the speed; absent = the receiver's own accuracy and no hard bound."""
     gps_variance_factor: Annotated[float, msgspec.Meta(ge=1)] = 1.0
     """On the receiver's own position variance. Its error wanders over a minute; a filter that takes ten fixes
     a second for independent soon trusts their mean too much, unless each counts for less."""
     gps_min_fix: Annotated[int, msgspec.Meta(ge=2, le=8)] = 3
+    """Least fix type (GPS_FIX_TYPE) of a fix that is used: 3 = 3-D, 4 = DGPS, 5 = RTK float, 6 = RTK fixed."""
     geoid_separation_m: float | None = None
     """Ellipsoid minus MSL height at the origin, for receivers that send only the other one."""
     uwb_sigma_m: Positive = 0.1
@@ -177,6 +191,7 @@ class TransportTable(Table, frozen=True):
     delay_jitter_s: NotNegative = 0.0
     """Injected after receive: mean of an exponential delay on top."""
     seed: Seed = 0
+    """Of what is injected."""
     faults: FaultsTable = msgspec.field(default_factory=FaultsTable)
     """What else is injected after receive."""
 

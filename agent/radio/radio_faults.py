@@ -24,6 +24,7 @@ class RadioOutage(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     from_s: Seconds
     """Since the agent first heard its autopilot: on one machine, since the simulated flight began."""
     to_s: Annotated[float, msgspec.Meta(gt=0, le=86_400)]
+    """Likewise; later than ``from_s``."""
     receivers: tuple[AgentId, ...] = ()
     """Who hears nothing; none named = all."""
     senders: tuple[AgentId, ...] = ()
@@ -63,6 +64,7 @@ class FaultsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     duplicate: Probability = 0.0
     """Probability that a packet comes twice, the copy with a delay of its own."""
     outages: tuple[RadioOutage, ...] = ()
+    """Groups that do not hear each other for a while: a partition."""
 
 
 def channel_settings(

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from datetime import UTC, datetime
 
-from agent.config.tables import FleetTable
-from agent.errors import ConfigError
+from agent.config.faults import Fault
+from agent.config.tables import FleetConfig, FleetTable
 from transport.messages.header import MAX_TICK
 
 SET_UNIX_S = 1_767_225_600.0
@@ -55,23 +55,20 @@ def clock_fault(fleet: FleetTable, unix_s: float) -> str | None:
     return f"clock at {_date(unix_s)}, outside the fleet's time"
 
 
-def require_epoch(fleet: FleetTable, where: str, *, unix_s: float) -> str | None:
-    """Check that the fleet's ticks fit packets at a UTC instant; ``where`` names the configuration.
+def require_epoch(config: FleetConfig, *, unix_s: float) -> str | None:
+    """Check that the fleet's ticks fit packets at a UTC instant.
 
     Raises `ConfigError` for an epoch that the instant is too far from. Where it may be that the host was not told the
     time yet (a companion computer before its first fix), what is wrong comes back as a line: it will be set.
     """
+    fleet = config.fleet
     fault = clock_fault(fleet, unix_s)
     if fault is None or unix_s < SET_UNIX_S or 0.0 < fleet.epoch_unix_s - unix_s < BEHIND_S:
         return fault
     span_s = MAX_TICK * fleet.period_s
     earliest, latest = max(unix_s - span_s, 0.0), unix_s
-    raise ConfigError(
-        where,
-        "fleet.epoch_unix_s",
-        f"{earliest:.0f}..{latest:.0f}, so that the ticks of now ({_date(unix_s)}) are 0..{MAX_TICK}",
-        f"{fleet.epoch_unix_s:.0f}",
-    )
+    expected = f"{earliest:.0f}..{latest:.0f}, so that the ticks of now ({_date(unix_s)}) are 0..{MAX_TICK}"
+    raise config.others.document.error(Fault("fleet.epoch_unix_s", expected, f"{fleet.epoch_unix_s:.0f}"))
 
 
 def _date(unix_s: float) -> str:

@@ -59,7 +59,7 @@ def agent(
     settings = with_options([("--out", "record.directory", None if out is None else str(out))], overrides)
     try:
         fleet = load_config(config, settings, profiles or ())
-        unset = require_epoch(fleet.fleet, str(config), unix_s=time.time())
+        unset = require_epoch(fleet, unix_s=time.time())
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.BAD_INPUT) from error
     try:

@@ -110,7 +110,7 @@ def _prepared(
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     run_files.refuse_inputs(folder, (config, *profiles))
     if live:
-        require_epoch(fleet.fleet, str(config), unix_s=time.time())
+        require_epoch(fleet, unix_s=time.time())
         for agent_id in fleet.ids:
             require(fleet, agent_id, config.parent, unix_s=time.time())
     fleet = run_files.in_folder(fleet, config.parent, folder)

@@ -122,7 +122,7 @@ def _write_folder(files: tuple[Path, ...], fleet: FleetConfig, out: Path | None)
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     mission = sitl_table(fleet).mission
     run_files.refuse_inputs(folder, (*files, *([mission] if mission is not None else [])))
-    require_epoch(fleet.fleet, str(files[0]), unix_s=time.time())
+    require_epoch(fleet, unix_s=time.time())
     keys = key_folder(fleet, files[0].parent)
     if fleet.security.mode == "signed":
         load_trust(keys, fleet.ids)

@@ -25,6 +25,7 @@ class SitlVehicleTable(Table, frozen=True):
     """``[[sitl.vehicles]]``: where the simulated autopilot of one agent is."""
 
     agent: AgentId
+    """Whose autopilot."""
     simulator: str
     """Address of its MAVLink link, e.g. ``tcp:127.0.0.1:5760`` or ``udpin:127.0.0.1:14540``."""
     gcs: str | None = None

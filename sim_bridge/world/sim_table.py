@@ -18,41 +18,56 @@ class GpsOutage(Table, frozen=True):
     """``[[sim.gps_outages]]``: one agent's receiver sees nothing for a while."""
 
     agent: AgentId
+    """Whose receiver."""
     from_s: NotNegative
+    """Since the start of the flight."""
     to_s: Positive
+    """Likewise; later than ``from_s``."""
 
 
 class WaypointsPath(Table, frozen=True, tag_field="kind", tag="waypoints"):
     """Fly to the points in turn, each held for a while."""
 
     agent: AgentId
+    """Who flies it."""
     points_m: Annotated[tuple[Point, ...], msgspec.Meta(min_length=1)]
+    """NED, the first one the start."""
     hold_s: Positive = 10.0
     """Time from one point to the next."""
     repeat: bool = True
+    """From the last point to the first again; else stay there."""
 
 
 class CirclePath(Table, frozen=True, tag_field="kind", tag="circle"):
     """A horizontal circle, right-handed about down (clockwise from above)."""
 
     agent: AgentId
+    """Who flies it."""
     center_m: Point
+    """NED."""
     radius_m: Positive = 5.0
+    """Of the circle."""
     lap_s: Positive = 20.0
+    """Time of one lap."""
     phase_rad: float = 0.0
+    """Where on it the flight starts."""
 
 
 class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
     """A horizontal Lissajous eight: north at the lap's frequency, east at twice that."""
 
     agent: AgentId
+    """Who flies it."""
     center_m: Point
+    """NED, where the eight crosses itself."""
     length_m: Positive = 10.0
     """North-south extent."""
     width_m: Positive = 5.0
     """East-west extent."""
     lap_s: Positive = 20.0
+    """Time of one lap."""
     phase_rad: float = 0.0
+    """Where on it the flight starts."""
 
 
 PathTable = WaypointsPath | CirclePath | FigureEightPath
@@ -62,16 +77,23 @@ class SimTable(Table, frozen=True):
     """``[sim]``: the simulated world; no agent reads it."""
 
     seed: Seed = 1
+    """Of starts and noise."""
     profile: Literal["paper", "realistic"] = "paper"
     """Noise: the paper's uniform one, or what real sensors look like."""
     duration_s: Positive = 60.0
+    """Length of the flight."""
     imu_hz: Annotated[float, msgspec.Meta(ge=10, le=1000)] = 100.0
+    """Rate of the simulated IMU."""
     attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
+    """Rate of the simulated attitude."""
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
+    """Rate of the simulated receiver."""
     uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
+    """Rate at which every pair ranges."""
     max_accel_mps2: Positive = 2.0
     """Commanded acceleration is clipped to this per axis."""
     gps_outages: tuple[GpsOutage, ...] = ()
+    """When which receivers see nothing."""
     paths: tuple[PathTable, ...] = ()
     """One per agent."""
 

@@ -59,6 +59,7 @@ def only(path: Path, *overrides: Override, profiles: tuple[Path, ...] = ()) -> C
         ('"udpin:127.0.0.1:14552"', "3", 14, "agent 7, mavlink", "expected a string, found 3"),
         ("id = 7\n", "id = 7\nautopilot = 'pix4'\n", 14, "agent 7, autopilot", "found 'pix4'; did you mean px4?"),
         ("id = 7", "id = 5", 13, "agents, entry 2, id", "expected distinct ids, found a second agent 5"),
+        ("[5, 7]", "[5, 7]]\nloss = [0", 6, "fleet.loss", "found an unknown key; did you mean transport.loss?"),
         ("exchange_fraction = 0.3", "exchange_fraction = nan", 17, "transport.exchange_fraction", "a finite number"),
         ("exchange_fraction = 0.3", "rounds_fraction = 0.8", 17, "transport.rounds_fraction", "at most 1 together"),
         ("exchange_fraction = 0.3", "exchange_fraction = 0.7", 16, "transport.rounds_fraction", "at most 1 together"),
@@ -113,6 +114,11 @@ def test_an_option_is_named_as_it_was_typed(tmp_path: Path) -> None:
 def test_what_stands_nowhere_is_told_of_the_file(tmp_path: Path) -> None:
     path = file(tmp_path, '[[agents]]\nid = 1\nmavlink = "udpin:127.0.0.1:1"\n')
     assert str(only(path)) == f"{path}: fleet: expected a table (it is required), found nothing"
+
+
+def test_a_profile_alone_is_no_fleet(tmp_path: Path) -> None:
+    path = file(tmp_path, "[transport]\nlink = 'udp'\n")
+    assert str(only(path)).endswith("no [fleet] and no [[agents]]; a profile is laid over a fleet's file by --with")
 
 
 def test_a_configuration_without_a_file_has_no_lines() -> None:

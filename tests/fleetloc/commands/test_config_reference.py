@@ -6,6 +6,7 @@ from pathlib import Path
 
 import msgspec
 
+from agent.config.retired import RETIRED
 from agent.config.tables import FleetConfig
 from fleetloc.config_reference import reference
 
@@ -24,3 +25,11 @@ def test_every_table_and_every_key_of_it_is_there() -> None:
     for key in ("period_s", "gps_speed_half_width_mps", "center_m", "lat_deg", "neighbour_timeout_s"):
         assert f"| `{key}` |" in page
     assert '`[[sim.paths]]`, kind = "circle"' in page
+    for key in RETIRED:
+        assert f"| `{key}` |" in page
+
+
+def test_every_key_says_what_it_means() -> None:
+    rows = [line.split(" | ") for line in reference().splitlines() if line.startswith("| `")]
+    assert len(rows) > 100
+    assert [row[0] for row in rows if not row[-1].strip(" |")] == []

@@ -32,6 +32,8 @@ class Delivery:
 
     share: dict[tuple[int, int], float]
     ages_s: list[float]
+    sent_s: list[float]
+    """When the packets of these ages were sent, UTC."""
     first_s: dict[tuple[int, int], float]
     """When the first packet of a pair came, s since the begin of the span; infinite = never."""
 
@@ -73,7 +75,9 @@ def delivery(directory: Path, pairs: list[tuple[int, int]], begin_s: float, end_
         pair: min((t + age for t, age in zip(found.sent_s, found.ages_s, strict=True)), default=np.inf) - begin_s
         for pair, found in heard.items()
     }
-    return Delivery(share, [age for found in heard.values() for age in found.ages_s], first_s)
+    ages_s = [age for found in heard.values() for age in found.ages_s]
+    sent_s = [t for found in heard.values() for t in found.sent_s]
+    return Delivery(share, ages_s, sent_s, first_s)
 
 
 def _numbers_sent(heard: dict[tuple[int, int], Pair], sender: int) -> set[tuple[Kind, int]]:

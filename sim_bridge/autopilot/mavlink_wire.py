@@ -7,7 +7,7 @@ from typing import Any
 
 from agent.mavlink.dialect import mavlink
 from sim_bridge.world.quaternions import Array, to_euler
-from sim_bridge.world.sensors import AttitudeSample, GpsFix, ImuSample
+from sim_bridge.world.sensors import GpsFix, SensedAttitude, SensedImu
 
 Message = Any
 """A pymavlink message; the library has no useful common type."""
@@ -37,7 +37,7 @@ def millimetres(value_m: float) -> int:
     return clamp(1e3 * value_m, -0x80000000, 0x7FFFFFFF)
 
 
-def highres_imu(time_us: int, imu: ImuSample) -> Message:
+def highres_imu(time_us: int, imu: SensedImu) -> Message:
     """HIGHRES_IMU: m/s2, rad/s, gauss, hPa, degC."""
     return mavlink.MAVLink_highres_imu_message(
         time_us,
@@ -53,7 +53,7 @@ def highres_imu(time_us: int, imu: ImuSample) -> Message:
     )
 
 
-def _scaled_axes(imu: ImuSample) -> tuple[int, ...]:
+def _scaled_axes(imu: SensedImu) -> tuple[int, ...]:
     """Accelerations in mG, rates in mrad/s, field in milligauss."""
     return (
         *(int16(1000.0 * float(axis) / STANDARD_GRAVITY_MPS2) for axis in imu.accel_mps2),
@@ -62,24 +62,24 @@ def _scaled_axes(imu: ImuSample) -> tuple[int, ...]:
     )
 
 
-def raw_imu(time_us: int, imu: ImuSample) -> Message:
+def raw_imu(time_us: int, imu: SensedImu) -> Message:
     """RAW_IMU as ArduPilot fills it: scaled to mG, mrad/s and milligauss, degC times 100."""
     return mavlink.MAVLink_raw_imu_message(
         time_us, *_scaled_axes(imu), id=0, temperature=round(100.0 * TEMPERATURE_DEG_C)
     )
 
 
-def scaled_imu(time_ms: int, imu: ImuSample) -> Message:
+def scaled_imu(time_ms: int, imu: SensedImu) -> Message:
     """SCALED_IMU."""
     return mavlink.MAVLink_scaled_imu_message(time_ms, *_scaled_axes(imu))
 
 
-def scaled_imu2(time_ms: int, imu: ImuSample) -> Message:
+def scaled_imu2(time_ms: int, imu: SensedImu) -> Message:
     """SCALED_IMU2, the second sensor; here the same one."""
     return mavlink.MAVLink_scaled_imu2_message(time_ms, *_scaled_axes(imu))
 
 
-def attitude_quaternion(time_ms: int, attitude: AttitudeSample) -> Message:
+def attitude_quaternion(time_ms: int, attitude: SensedAttitude) -> Message:
     """ATTITUDE_QUATERNION: w x y z body to NED, rad/s."""
     return mavlink.MAVLink_attitude_quaternion_message(
         time_ms,
@@ -88,7 +88,7 @@ def attitude_quaternion(time_ms: int, attitude: AttitudeSample) -> Message:
     )
 
 
-def attitude_euler(time_ms: int, attitude: AttitudeSample) -> Message:
+def attitude_euler(time_ms: int, attitude: SensedAttitude) -> Message:
     """ATTITUDE: roll, pitch, yaw in rad."""
     return mavlink.MAVLink_attitude_message(
         time_ms, *to_euler(attitude.quaternion), *(float(axis) for axis in attitude.rates_rps)
@@ -152,7 +152,7 @@ def global_position_int(
     )
 
 
-def odometry(time_us: int, position_m: Array, velocity_body: Array, attitude: AttitudeSample) -> Message:
+def odometry(time_us: int, position_m: Array, velocity_body: Array, attitude: SensedAttitude) -> Message:
     """ODOMETRY as PX4 sends it: LOCAL_NED about its origin, BODY_FRD, off-diagonal covariances NaN."""
     covariance = [math.nan] * 21
     for diagonal, variance in zip((0, 6, 11, 15, 18, 20), (0.1, 0.1, 0.2, 1e-4, 1e-4, 1e-3), strict=True):

@@ -14,7 +14,7 @@ from sim_bridge.autopilot.streams import StreamTable
 from sim_bridge.autopilot.truth_messages import TrueState
 from sim_bridge.world import geodesy
 from sim_bridge.world.quaternions import Array
-from sim_bridge.world.sensors import AttitudeSample, ImuSample
+from sim_bridge.world.sensors import SensedAttitude, SensedImu
 
 
 class Vehicle(Protocol):
@@ -25,11 +25,11 @@ class Vehicle(Protocol):
         """On the ground and at rest."""
         ...
 
-    def imu(self) -> ImuSample:
+    def imu(self) -> SensedImu:
         """A new sample."""
         ...
 
-    def attitude(self) -> AttitudeSample:
+    def attitude(self) -> SensedAttitude:
         """The present attitude."""
         ...
 

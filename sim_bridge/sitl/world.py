@@ -21,7 +21,7 @@ from sim_bridge.world.guidance import default_path
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.scenario_config import scenario_from_config
-from sim_bridge.world.sensors import FleetSensors, RangeSet
+from sim_bridge.world.sensors import FleetSensors, SensedRanges
 from sim_bridge.world.simulation import aligned_start
 from sim_bridge.world.truth import Truth, TruthError
 from sim_bridge.world.world import STEP_RATE_HZ, FleetWorld
@@ -97,7 +97,7 @@ class SitlWorld:
         found = (track.position_at(host_s) for track in self.tracks.values())
         return np.array([missing if position is None else position for position in found])
 
-    def ranges(self, now_s: float) -> list[tuple[float, RangeSet]]:
+    def ranges(self, now_s: float) -> list[tuple[float, SensedRanges]]:
         """The ranges whose turn has come, with their instants; turns that were slept through are left out."""
         run = self._run
         if run is None or not run.move_to(now_s):

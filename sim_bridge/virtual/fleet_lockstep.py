@@ -29,7 +29,7 @@ from sim_bridge.virtual.virtual_fleet import OnEstimate, VirtualDrone, VirtualFl
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.sensor_feed import Sensed, SensorFeed
-from sim_bridge.world.sensors import RangeSet
+from sim_bridge.world.sensors import SensedRanges
 from sim_bridge.world.simulation import STEP_TOLERANCE_S, Simulation
 from sim_bridge.world.truth import Truth
 from sim_bridge.world.uwb_frames import UwbDrivers
@@ -240,7 +240,7 @@ class FleetLockstep:
         for answer in self._simulation.receive(agent_id, frame, self.queue.now_s):
             self._to_agent(agent_id, answer)
 
-    def _on_ranges(self, measured: RangeSet, taken_s: float) -> None:
+    def _on_ranges(self, measured: SensedRanges, taken_s: float) -> None:
         drone = self.fleet.drones.get(measured.observer)
         heard = tuple(each for each in measured.ranges if each.target in self.fleet.drones)
         if drone is None or (measured.ranges and not heard):

@@ -12,7 +12,7 @@ from typing import Any
 
 from agent.sensing.samples import AttitudeSample, ImuSample
 from sim_bridge.autopilot.mavlink_wire import gps_raw_int
-from sim_bridge.world.sensors import RangeSet, quaternion_of, vector_of
+from sim_bridge.world.sensors import SensedRanges, quaternion_of, vector_of
 from sim_bridge.world.simulation import Simulation
 from sim_bridge.world.truth import Truth, TruthRecorder
 
@@ -28,10 +28,10 @@ class Sensed:
 
     samples: list[tuple[int, ImuSample | AttitudeSample]] = field(default_factory=list)
     fixes: list[tuple[int, Any]] = field(default_factory=list)
-    ranges: list[RangeSet] = field(default_factory=list)
+    ranges: list[SensedRanges] = field(default_factory=list)
 
 
-class _Grid:
+class _StepGrid:
     """Which steps a sensor of a rate falls on."""
 
     def __init__(self, rate_hz: float, step_s: float) -> None:
@@ -55,8 +55,8 @@ class SensorFeed:
         self._simulation = simulation
         self._start_fleet_s = start_fleet_s
         scenario, step_s = simulation.scenario, simulation.world.step_s
-        self._imu = _Grid(min(imu_hz, scenario.imu_hz), step_s)
-        self._attitude = _Grid(min(attitude_hz, scenario.attitude_hz), step_s)
+        self._imu = _StepGrid(min(imu_hz, scenario.imu_hz), step_s)
+        self._attitude = _StepGrid(min(attitude_hz, scenario.attitude_hz), step_s)
         self._truth_every = max(round(1.0 / (scenario.truth_hz * step_s)), 1)
         self._recorder = TruthRecorder(scenario.ids, simulation.sensors.pair_bias_m)
         self._record()

@@ -23,7 +23,7 @@ GRID_TOLERANCE_S = 1e-6
 
 
 @dataclass(frozen=True, slots=True)
-class ImuSample:
+class SensedImu:
     """Mean over the last inner step, body FRD: ``accel_mps2`` (specific force) and ``gyro_rps`` ``(3,)``."""
 
     time_s: float
@@ -35,7 +35,7 @@ class ImuSample:
 
 
 @dataclass(frozen=True, slots=True)
-class AttitudeSample:
+class SensedAttitude:
     """``quaternion`` ``(4,)`` w x y z, body FRD into NED; ``rates_rps`` ``(3,)`` body."""
 
     time_s: float
@@ -49,7 +49,7 @@ def vector_of(array: Array) -> tuple[float, float, float]:
     return x, y, z
 
 
-def quaternion_of(attitude: AttitudeSample) -> tuple[float, float, float, float]:
+def quaternion_of(attitude: SensedAttitude) -> tuple[float, float, float, float]:
     """Four plain numbers, w x y z."""
     w, x, y, z = attitude.quaternion.tolist()
     return w, x, y, z
@@ -92,7 +92,7 @@ class RangeMeasurement:
 
 
 @dataclass(frozen=True, slots=True)
-class RangeSet:
+class SensedRanges:
     """All ranges that one observer took at ``time_s``."""
 
     observer: int
@@ -276,12 +276,12 @@ class FleetSensors:
         self._body_rates = world.body_rates()
         self._body_step = world.step_index
 
-    def imu(self, slot: int) -> ImuSample:
+    def imu(self, slot: int) -> SensedImu:
         """A new sample of one vehicle's inertial sensors, magnetometer and barometer."""
         self._to_body()
         frame = self._scenario.frame
         alt_msl_m = geodesy.msl_m(frame, frame.alt_m - float(self._world.position_m[slot, 2]))
-        return ImuSample(
+        return SensedImu(
             self._world.time_s,
             self._imu[slot].accel(self._body_force[slot]),
             self._imu[slot].gyro(self._body_rates[slot]),
@@ -290,7 +290,7 @@ class FleetSensors:
             alt_msl_m,
         )
 
-    def attitude(self, slot: int) -> AttitudeSample:
+    def attitude(self, slot: int) -> SensedAttitude:
         """What the autopilot of one vehicle takes for its attitude."""
         self._to_body()
         time_s = self._world.time_s
@@ -299,7 +299,7 @@ class FleetSensors:
         if error.any():
             turn = quaternions.from_rotation_vector(error[None])
             quaternion = quaternions.multiply(quaternion[None], turn)[0]
-        return AttitudeSample(time_s, quaternion, self._imu[slot].gyro(self._body_rates[slot]))
+        return SensedAttitude(time_s, quaternion, self._imu[slot].gyro(self._body_rates[slot]))
 
     def fixes(self) -> list[tuple[int, GpsFix]]:
         """Slots and fixes whose messages leave the receivers at this step."""
@@ -353,7 +353,7 @@ class FleetSensors:
             vdop=noise.vdop,
         )
 
-    def ranges(self) -> list[RangeSet]:
+    def ranges(self) -> list[SensedRanges]:
         """The ranges taken at this step, a set per observer whose turn it is."""
         time_s = self._world.time_s
         sets = []
@@ -361,7 +361,7 @@ class FleetSensors:
             if self._uwb_grids[slot].due(time_s):
                 measured = tuple(self._range_all(slot, observer))
                 if measured:
-                    sets.append(RangeSet(observer, time_s, measured))
+                    sets.append(SensedRanges(observer, time_s, measured))
         return sets
 
     def _range_all(self, slot: int, observer: int) -> list[RangeMeasurement]:

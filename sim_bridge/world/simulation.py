@@ -21,7 +21,7 @@ from sim_bridge.world import quaternions
 from sim_bridge.world.guidance import Waypoints, default_path
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Reboot, Scenario
-from sim_bridge.world.sensors import AttitudeSample, FleetSensors, ImuSample, RangeSet
+from sim_bridge.world.sensors import FleetSensors, SensedAttitude, SensedImu, SensedRanges
 from sim_bridge.world.truth import Truth, TruthRecorder
 from sim_bridge.world.world import Dynamics, FleetWorld
 
@@ -40,7 +40,7 @@ class Outputs:
     """What left the simulated fleet: frames by agent, ranges with their time on the clock of ``now``."""
 
     frames: list[tuple[int, bytes]] = field(default_factory=list)
-    ranges: list[tuple[float, RangeSet]] = field(default_factory=list)
+    ranges: list[tuple[float, SensedRanges]] = field(default_factory=list)
 
 
 class SimulatedVehicle:
@@ -49,21 +49,21 @@ class SimulatedVehicle:
     def __init__(self, scenario: Scenario, world: FleetWorld, sensors: FleetSensors, slot: int) -> None:
         self._scenario, self._world, self._sensors, self._slot = scenario, world, sensors, slot
         self._path = scenario.vehicles[slot].path or default_path(slot, len(scenario.ids))
-        self._imu: ImuSample | None = None
-        self._attitude: AttitudeSample | None = None
+        self._imu: SensedImu | None = None
+        self._attitude: SensedAttitude | None = None
 
     @property
     def landed(self) -> bool:
         """On the ground and at rest."""
         return bool(self._world.landed[self._slot])
 
-    def imu(self) -> ImuSample:
+    def imu(self) -> SensedImu:
         """The sample of this step."""
         if self._imu is None or self._imu.time_s != self._world.time_s:
             self._imu = self._sensors.imu(self._slot)
         return self._imu
 
-    def attitude(self) -> AttitudeSample:
+    def attitude(self) -> SensedAttitude:
         """The attitude of this step."""
         if self._attitude is None or self._attitude.time_s != self._world.time_s:
             self._attitude = self._sensors.attitude(self._slot)

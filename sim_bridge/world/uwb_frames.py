@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from sim_bridge.world.sensors import RangeSet
+from sim_bridge.world.sensors import SensedRanges
 from transport.messages.uwb_body import MAX_RANGE_M, UwbFrame, UwbRange, encode_uwb_json
 
 
@@ -12,11 +12,11 @@ class UwbDrivers:
     def __init__(self) -> None:
         self._sequence: dict[int, int] = {}
 
-    def payload(self, taken_s: float, ranges: RangeSet) -> bytes:
+    def payload(self, taken_s: float, ranges: SensedRanges) -> bytes:
         """One frame as it travels, stamped ``taken_s`` as CLOCK_MONOTONIC of this host."""
         return encode_uwb_json(self.frame(taken_s, ranges))
 
-    def frame(self, taken_s: float, ranges: RangeSet) -> UwbFrame:
+    def frame(self, taken_s: float, ranges: SensedRanges) -> UwbFrame:
         """The same as a value."""
         sequence = self._sequence.get(ranges.observer, 0)
         self._sequence[ranges.observer] = sequence + 1

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from pymavlink.dialects.v20 import ardupilotmega as mavlink
 
 from sim_bridge.autopilot import mavlink_wire as wire
-from sim_bridge.world.sensors import AttitudeSample, GpsFix, ImuSample
+from sim_bridge.world.sensors import GpsFix, SensedAttitude, SensedImu
 
 accel = st.lists(st.floats(-80.0, 80.0), min_size=3, max_size=3).map(np.array)
 gyro = st.lists(st.floats(-20.0, 20.0), min_size=3, max_size=3).map(np.array)
 mag = st.lists(st.floats(-1.0, 1.0), min_size=3, max_size=3).map(np.array)
-imus = st.builds(ImuSample, st.just(0.0), accel, gyro, mag, st.floats(300.0, 1100.0), st.floats(-100.0, 5000.0))
+imus = st.builds(SensedImu, st.just(0.0), accel, gyro, mag, st.floats(300.0, 1100.0), st.floats(-100.0, 5000.0))
 fixes = st.builds(
     GpsFix,
     time_s=st.just(0.0),
@@ -66,7 +66,7 @@ def test_raw_imu_is_in_milli_g_and_milliradians(imu):
 
 
 def test_integer_fields_saturate_instead_of_wrapping():
-    imu = ImuSample(0.0, np.full(3, 500.0), np.full(3, -90.0), np.zeros(3), 1000.0, 0.0)
+    imu = SensedImu(0.0, np.full(3, 500.0), np.full(3, -90.0), np.zeros(3), 1000.0, 0.0)
     got = through_the_codec(wire.scaled_imu2(5, imu))
     assert (got.xacc, got.xgyro) == (32767, -32768)
 
@@ -96,7 +96,7 @@ def test_a_receiver_without_solution_says_unknown():
 
 def test_attitude_quaternion_and_euler_agree():
     half = math.radians(15.0)
-    attitude = AttitudeSample(0.0, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array([0.1, 0.2, 0.3]))
+    attitude = SensedAttitude(0.0, np.array([math.cos(half), 0.0, 0.0, math.sin(half)]), np.array([0.1, 0.2, 0.3]))
     quaternion = through_the_codec(wire.attitude_quaternion(77, attitude))
     euler = through_the_codec(wire.attitude_euler(77, attitude))
     assert quaternion.time_boot_ms == euler.time_boot_ms == 77

@@ -21,7 +21,7 @@ from sim_bridge.autopilot.commands import Command, CommandHandler
 from sim_bridge.autopilot.external_feed import Refused
 from sim_bridge.autopilot.flavours import FLAVOURS, STREAM_GROUPS
 from sim_bridge.autopilot.mavlink_wire import Message
-from sim_bridge.autopilot.state import AutopilotState, BootClock, ParameterTable, Vehicle
+from sim_bridge.autopilot.state import AutopilotState, CrystalClock, ParameterTable, Vehicle
 from sim_bridge.autopilot.stream_messages import StreamMessages
 from sim_bridge.autopilot.streams import StreamTable
 from sim_bridge.world.noise import FlavourName
@@ -109,7 +109,7 @@ class FakeAutopilot:
         self.state = AutopilotState(
             flavour,
             setup.frame,
-            BootClock(now, setup.clock_skew_ppm, setup.stamp_quantum_us),
+            CrystalClock(now, setup.clock_skew_ppm, setup.stamp_quantum_us),
             self._parameters,
             StreamTable(flavour, limits),
             airborne=not self._vehicle.landed,

@@ -58,7 +58,7 @@ class Vehicle(Protocol):
         ...
 
 
-class BootClock:
+class CrystalClock:
     """Time since boot as the autopilot's crystal counts it."""
 
     def __init__(self, boot_s: float, skew_ppm: float = 0.0, quantum_us: int = 1) -> None:
@@ -131,7 +131,7 @@ class AutopilotState:
         self,
         flavour: Flavour,
         frame: FleetFrame,
-        clock: BootClock,
+        clock: CrystalClock,
         parameters: ParameterTable,
         streams: StreamTable,
         *,

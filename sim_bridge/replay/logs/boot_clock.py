@@ -183,7 +183,7 @@ class BootClockFit:
             self._take(*suspect)
 
 
-class BootClock:
+class LogBootClock:
     """Log time of a vehicle's boot times, each by the boot that was running when the message arrived."""
 
     def __init__(self, sessions: list[BootSession]) -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from sim_bridge.replay.logs.boot_clock import MAX_POINTS, BootClock, BootClockFit
+from sim_bridge.replay.logs.boot_clock import MAX_POINTS, BootClockFit, LogBootClock
 from sim_bridge.replay.logs.gps_time import GpsTimeFit, fitted, unix_of_week
 from sim_bridge.replay.logs.stamps import StampRepair, without_outliers
 
@@ -83,11 +83,11 @@ def test_one_damaged_stamp_in_five_is_repaired(count: int, data: st.DataObject) 
     assert max(abs(a - b) for a, b in zip(repaired, stamps, strict=True)) <= 20_000
 
 
-def fit(boots_s: list[float], arrivals_s: list[float]) -> tuple[BootClockFit, BootClock]:
+def fit(boots_s: list[float], arrivals_s: list[float]) -> tuple[BootClockFit, LogBootClock]:
     made = BootClockFit()
     for boot_s, arrival_s in zip(boots_s, arrivals_s, strict=True):
         made.add(boot_s, arrival_s)
-    return made, BootClock(made.sessions())
+    return made, LogBootClock(made.sessions())
 
 
 @pytest.mark.parametrize("drift", [0.0, 1e-5, -0.003, 0.017, 0.02])
@@ -156,7 +156,7 @@ def test_no_pairs_break_the_fit(pairs: list[tuple[float, float]]) -> None:
     made = BootClockFit()
     for boot_s, arrival_s in sorted(pairs, key=lambda pair: pair[1]):
         made.add(boot_s, arrival_s)
-    clock = BootClock(made.sessions())
+    clock = LogBootClock(made.sessions())
     for boot_s, arrival_s in pairs:
         log_s = clock.log_s(boot_s, arrival_s)
         assert log_s is not None

@@ -17,7 +17,7 @@ from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.sample_adapter import UNIX_US
 from agent.mavlink.session import FLAVOURS
 from agent.sensing.frames import FleetFrame
-from sim_bridge.replay.logs.boot_clock import BootClock, BootClockFit
+from sim_bridge.replay.logs.boot_clock import BootClockFit, LogBootClock
 from sim_bridge.replay.logs.events import (
     Flavour,
     Format,
@@ -107,7 +107,7 @@ class TlogSource(SurveyedLog):
     def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
         super().__init__(path, frame, sensors)
         self._sources: dict[int, Source] = {}
-        self._clocks: dict[int, BootClock] = {}
+        self._clocks: dict[int, LogBootClock] = {}
         self._clock_notes: Counter[str] = Counter()
 
     def events(self) -> Iterator[LogEvent]:
@@ -178,7 +178,7 @@ class TlogSource(SurveyedLog):
         if not self._sources:
             raise LogError(self.path, "frames of an autopilot", _what_else(heard, counts))
         self._clocks = {
-            system_id: BootClock(heard[source].clock.sessions()) for system_id, source in self._sources.items()
+            system_id: LogBootClock(heard[source].clock.sessions()) for system_id, source in self._sources.items()
         }
         self._clock_notes = sum((_clock_notes(heard[source].clock) for source in self._sources.values()), Counter())
         systems = {system_id: _system(system_id, heard[source]) for system_id, source in self._sources.items()}

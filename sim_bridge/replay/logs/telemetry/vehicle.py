@@ -16,7 +16,7 @@ from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.samples import AutopilotEstimate, Quaternion, RangeSample, Triple
-from sim_bridge.replay.logs.boot_clock import BootClock
+from sim_bridge.replay.logs.boot_clock import LogBootClock
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 
 TRUTHS = ("SIM_STATE", "HIL_STATE_QUATERNION", "SIMSTATE")
@@ -40,7 +40,7 @@ class LoggedVehicle:
     """Messages of one autopilot, in order of arrival, to samples on log time; ``wanted`` are the ids of those."""
 
     def __init__(
-        self, frame: FleetFrame, sensors: SensorsTable, epoch_unix_s: float, clock: BootClock, found: SystemSurvey
+        self, frame: FleetFrame, sensors: SensorsTable, epoch_unix_s: float, clock: LogBootClock, found: SystemSurvey
     ) -> None:
         self._frame = frame
         self._clock = clock

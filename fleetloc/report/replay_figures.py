@@ -13,10 +13,10 @@ from fleetloc.report.fleet_report import counted_packets, counted_sensors
 from fleetloc.run import run_files
 from fleetloc.run.replay_run import Replayed, track_path
 from fleetloc.run.replay_setup import Prepared
-from sim_bridge.replay.comparison import Compared, Errors, Phase, References, compare, first_estimate_s
+from sim_bridge.replay.comparison import Compared, ComparedTracks, Errors, Phase, compare, first_estimate_s
 from sim_bridge.replay.logs.events import LogSource
 from sim_bridge.replay.naming import names_apart
-from sim_bridge.replay.tracks import Track
+from sim_bridge.replay.tracks import WrittenTrack
 
 SETTLED_S = 10.0
 """Figures are also given from here on after an agent's first estimate, when its start is forgotten."""
@@ -28,7 +28,7 @@ class Results:
     """A replay against what it can be compared with, by agent."""
 
     compared: dict[int, Compared]
-    references: dict[int, References]
+    references: dict[int, ComparedTracks]
     phases: dict[int, list[Phase]]
     first_s: dict[int, float | None]
     """Fleet time of the first estimate; ``None`` where there never was one."""
@@ -39,8 +39,8 @@ def load_results(prepared: Prepared, directory: Path) -> Results:
     config, layout = prepared.config, Layout(prepared.config.ids)
     agents = [vehicle.agent_id for vehicle in prepared.inputs.plan.vehicles]
     references = {
-        agent_id: References(
-            *(Track(track_path(directory, kind, agent_id)) for kind in ("truth", "autopilot", "gps", "gps_received"))
+        agent_id: ComparedTracks(
+            *(WrittenTrack(track_path(directory, kind, agent_id)) for kind in ("truth", "autopilot", "gps", "gps_received"))
         )
         for agent_id in agents
     }

@@ -19,13 +19,13 @@ from sim_bridge.replay.feed import Inputs
 from sim_bridge.replay.logs.events import LogSource, TruthSample
 from sim_bridge.replay.logs.opening import open_log
 from sim_bridge.replay.naming import names_apart
-from sim_bridge.replay.plan import Plan, Vehicle, make_plan
+from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan, make_plan
 from sim_bridge.replay.range_files import UNIX_FROM_S, RangeCounts, RangeLine, read_ranges
 from sim_bridge.replay.reading import surveyed
 from sim_bridge.replay.recorded_ranges import ranges_of_record
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
 from sim_bridge.replay.truth_files import TruthFile
-from sim_bridge.replay.what_if import GpsDrop, GpsDrops, Window
+from sim_bridge.replay.what_if import GpsDrop, GpsDrops, ReplaySpan
 
 SYNTHETIC = "synthetic"
 LOGGED, STAMPED = "logged", "stamped"
@@ -89,7 +89,7 @@ def prepare(options: Options) -> Prepared:
     files = _truth_files(options.truth, FleetFrame.of(config), sources)
     plan = make_plan(config, sources, _better_clocks(sources, files))
     config = _with_epoch(config, plan)
-    from_s, to_s = Window(options.from_s, options.to_s).resolved(plan.start_s, plan.end_s)
+    from_s, to_s = ReplaySpan(options.from_s, options.to_s).resolved(plan.start_s, plan.end_s)
     from_s, to_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
     if not from_s < to_s:
         raise InputError("--from/--to", "", f"a part of {plan.end_s - plan.start_s:.1f} s", "nothing of it")
@@ -147,7 +147,7 @@ def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], st
     return config, sources, origin_from
 
 
-def _with_epoch(config: FleetConfig, plan: Plan) -> FleetConfig:
+def _with_epoch(config: FleetConfig, plan: ReplayPlan) -> FleetConfig:
     """Fleet time as the plan has it: ticks of the configured epoch would be too large for old logs, or negative."""
     replaced = msgspec.structs.replace
     return replaced(config, fleet=replaced(config.fleet, epoch_unix_s=plan.epoch_unix_s or 0.0))
@@ -159,7 +159,7 @@ Key = tuple[Path, int]
 """A vehicle: its log and system id."""
 
 
-def _key(vehicle: Vehicle) -> Key:
+def _key(vehicle: PlannedVehicle) -> Key:
     return vehicle.source.path, vehicle.survey.system_id
 
 
@@ -185,7 +185,7 @@ def _better_clocks(sources: Sequence[LogSource], files: dict[Key, TruthFile]) ->
     return zeros
 
 
-def _fleet_timed(vehicle: Vehicle, file: TruthFile, plan: Plan) -> Iterator[TruthSample]:
+def _fleet_timed(vehicle: PlannedVehicle, file: TruthFile, plan: ReplayPlan) -> Iterator[TruthSample]:
     """The states of a file on fleet time."""
     boot = vehicle.source.format != "tlog" and file.has_boot_clock()
     if not boot and plan.epoch_unix_s is None:
@@ -195,7 +195,7 @@ def _fleet_timed(vehicle: Vehicle, file: TruthFile, plan: Plan) -> Iterator[Trut
         yield replace(sample, t_s=sample.t_s + shift_s)
 
 
-def _truth_words(plan: Plan, files: dict[Key, TruthFile]) -> str:
+def _truth_words(plan: ReplayPlan, files: dict[Key, TruthFile]) -> str:
     if files:
         names = names_apart(file.path for file in files.values())
         return "files " + ", ".join(names[files[_key(vehicle)].path] for vehicle in plan.vehicles)
@@ -208,7 +208,7 @@ def _truth_words(plan: Plan, files: dict[Key, TruthFile]) -> str:
 
 
 def _ranges(
-    options: Options, config: FleetConfig, plan: Plan, counts: RangeCounts
+    options: Options, config: FleetConfig, plan: ReplayPlan, counts: RangeCounts
 ) -> tuple[Iterator[RangeLine] | Synthesiser | None, str]:
     """What gives the ranges, and how the report names it."""
     if not options.ranges:
@@ -240,7 +240,7 @@ def _read(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:
     return ranges_of_record(path, counts) if path.suffix == RECORD_SUFFIX else read_ranges(path, counts)
 
 
-def _fleet_timed_ranges(lines: Iterator[RangeLine], plan: Plan) -> Iterator[RangeLine]:
+def _fleet_timed_ranges(lines: Iterator[RangeLine], plan: ReplayPlan) -> Iterator[RangeLine]:
     """Ranges on fleet time; small times count from the start of the logs."""
     for line in lines:
         shift_s = -(plan.epoch_unix_s or 0.0) if line.time_s >= UNIX_FROM_S else plan.start_s

@@ -9,12 +9,12 @@ import msgspec
 import numpy as np
 
 from fleetloc.run.live_truth import PERIOD_S, TruthSample
-from sim_bridge.sitl.bridge import Progress
+from sim_bridge.sitl.bridge import BridgeProgress
 from sim_bridge.sitl.world import SitlWorld
 
 
 class ProgressLine(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """`Progress` on the pipe; a truth has other keys."""
+    """`BridgeProgress` on the pipe; a truth has other keys."""
 
     missing: tuple[str, ...] = ()
     ready: bool = False
@@ -27,7 +27,7 @@ class LineWriter:
     def __init__(self) -> None:
         self._next_s = 0.0
 
-    def progress(self, progress: Progress) -> None:
+    def progress(self, progress: BridgeProgress) -> None:
         """For ``bridge(on_progress=...)``."""
         _write(msgspec.json.encode(ProgressLine(progress.missing, progress.ready, progress.begun_unix_s)))
 

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.flavours import FlightMode
 from sim_bridge.autopilot.mavlink_wire import Message
-from sim_bridge.autopilot.state import AutopilotState, Vehicle
+from sim_bridge.autopilot.state import AutopilotState, AutopilotVehicle
 
 ACCEPTED = int(mavlink.MAV_RESULT_ACCEPTED)
 DENIED = int(mavlink.MAV_RESULT_DENIED)
@@ -48,7 +48,7 @@ class CommandHandler:
     def __init__(
         self,
         state: AutopilotState,
-        vehicle: Vehicle,
+        vehicle: AutopilotVehicle,
         send_now: Callable[[int], int],
         send: Callable[[Message], None],
     ) -> None:

@@ -21,7 +21,7 @@ from sim_bridge.autopilot.commands import Command, CommandHandler
 from sim_bridge.autopilot.external_feed import Refused
 from sim_bridge.autopilot.flavours import FLAVOURS, STREAM_GROUPS
 from sim_bridge.autopilot.mavlink_wire import Message
-from sim_bridge.autopilot.state import AutopilotState, CrystalClock, ParameterTable, Vehicle
+from sim_bridge.autopilot.state import AutopilotState, AutopilotVehicle, CrystalClock, ParameterTable
 from sim_bridge.autopilot.stream_messages import StreamMessages
 from sim_bridge.autopilot.streams import StreamTable
 from sim_bridge.world.noise import FlavourName
@@ -70,7 +70,7 @@ class AutopilotCounters:
 class FakeAutopilot:
     """One autopilot. Feed it bytes and time; take its frames."""
 
-    def __init__(self, setup: AutopilotSetup, vehicle: Vehicle, now: float) -> None:
+    def __init__(self, setup: AutopilotSetup, vehicle: AutopilotVehicle, now: float) -> None:
         """Boots at ``now``; in the air it is armed and on its mission."""
         self.setup = setup
         self.counters = AutopilotCounters()

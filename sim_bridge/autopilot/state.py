@@ -17,7 +17,7 @@ from sim_bridge.world.quaternions import Array
 from sim_bridge.world.sensors import SensedAttitude, SensedImu
 
 
-class Vehicle(Protocol):
+class AutopilotVehicle(Protocol):
     """Sensors and actuators of one vehicle, as its autopilot sees them; positions NED in the fleet frame."""
 
     @property

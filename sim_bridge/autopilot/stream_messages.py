@@ -9,7 +9,7 @@ import numpy as np
 from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot import mavlink_wire as wire
 from sim_bridge.autopilot.mavlink_wire import Message
-from sim_bridge.autopilot.state import AutopilotState, Vehicle
+from sim_bridge.autopilot.state import AutopilotState, AutopilotVehicle
 from sim_bridge.autopilot.truth_messages import Geodetic, TrueState, hil_state_quaternion, sim_state, simstate
 from sim_bridge.world import quaternions
 
@@ -29,7 +29,7 @@ Builder = Callable[[float], Message | None]
 class StreamMessages:
     """Builds the messages; ``None`` where the autopilot has nothing to say yet."""
 
-    def __init__(self, state: AutopilotState, vehicle: Vehicle, unix_offset_s: float, system_id: int) -> None:
+    def __init__(self, state: AutopilotState, vehicle: AutopilotVehicle, unix_offset_s: float, system_id: int) -> None:
         """``unix_offset_s``: Unix time minus the clock of ``now``."""
         self._state, self._vehicle, self._unix_offset_s = state, vehicle, unix_offset_s
         self._system_id = system_id

@@ -14,7 +14,7 @@ from agent.log.estimate_log import record_chunks
 from estimators.estimator import Status
 from estimators.model.layout import STATES_PER_AGENT, Layout, block
 from sim_bridge.replay.statistics import Floats, Spread, Thinned
-from sim_bridge.replay.tracks import Track
+from sim_bridge.replay.tracks import WrittenTrack
 
 MAX_TRUTH_GAP_S = 0.5
 MAX_AUTOPILOT_GAP_S = 1.5
@@ -77,14 +77,14 @@ class Compared:
 
 
 @dataclass(frozen=True, slots=True)
-class References:
+class ComparedTracks:
     """The tracks of one agent."""
 
-    truth: Track
-    autopilot: Track
-    gps: Track
+    truth: WrittenTrack
+    autopilot: WrittenTrack
+    gps: WrittenTrack
     """Fixes at the times of their stamps."""
-    gps_received: Track
+    gps_received: WrittenTrack
     """Fixes at the times of their arrival."""
 
 
@@ -101,7 +101,7 @@ def compare(
     path: Path,
     layout: Layout,
     agent_id: int,
-    references: Mapping[int, References],
+    references: Mapping[int, ComparedTracks],
     phases: Sequence[Phase],
     period_s: float,
 ) -> Compared:
@@ -134,7 +134,7 @@ def _compare_chunk(
     result: Compared,
     chunk: NDArray[np.void],
     layout: Layout,
-    references: Mapping[int, References],
+    references: Mapping[int, ComparedTracks],
     phases: Sequence[Phase],
     period_s: float,
 ) -> None:
@@ -167,7 +167,7 @@ def _compare_chunk(
         result.series.add(row)
 
 
-def _compare_sensors(errors: Errors, references: References, phase: Phase) -> None:
+def _compare_sensors(errors: Errors, references: ComparedTracks, phase: Phase) -> None:
     """What the autopilot believed and the receiver said, each at its own times, against the truth."""
     for track, whole, horizontal, vertical in (
         (references.autopilot, errors.autopilot_position, errors.autopilot_horizontal, errors.autopilot_vertical),
@@ -178,7 +178,7 @@ def _compare_sensors(errors: Errors, references: References, phase: Phase) -> No
             _add_position(whole, horizontal, vertical, _against_truth(entries, references.truth, phase))
 
 
-def _against_truth(entries: NDArray[np.void], truth: Track, phase: Phase) -> Floats:
+def _against_truth(entries: NDArray[np.void], truth: WrittenTrack, phase: Phase) -> Floats:
     entries = entries[(entries["t_s"] >= phase.from_s) & (entries["t_s"] <= phase.to_s)]
     return np.asarray(entries["position_m"] - truth.at(np.asarray(entries["t_s"]), MAX_TRUTH_GAP_S)[:, :3])
 
@@ -190,7 +190,7 @@ def _add_position(whole: Spread | None, horizontal: Spread, vertical: Spread, er
     vertical.add(np.abs(error[:, 2]))
 
 
-def _truth_of(references: References | None, t_s: Floats) -> Floats:
+def _truth_of(references: ComparedTracks | None, t_s: Floats) -> Floats:
     return np.full((len(t_s), BLOCK), np.nan) if references is None else references.truth.at(t_s, MAX_TRUTH_GAP_S)
 
 
@@ -218,7 +218,7 @@ def _nees(error: Floats, covariance: Floats) -> Floats:
     return values
 
 
-def _pieces(track: Track) -> Iterator[NDArray[np.void]]:
+def _pieces(track: WrittenTrack) -> Iterator[NDArray[np.void]]:
     count = CHUNK_NUMBERS // 7
     for at in range(0, len(track), count):
         yield track.entries[at : at + count]

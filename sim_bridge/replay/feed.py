@@ -18,7 +18,7 @@ from typing import Any, Protocol
 
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
 from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
-from sim_bridge.replay.plan import Plan, Vehicle
+from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
 from sim_bridge.replay.range_files import RangeCounts, RangeLine
 from sim_bridge.replay.synthesis import Synthesiser
 from sim_bridge.replay.what_if import GpsDrops
@@ -53,7 +53,7 @@ class Inputs:
     ``range_counts`` and ``truth_skipped`` are where the streams from files count, while they are read.
     """
 
-    plan: Plan
+    plan: ReplayPlan
     drops: GpsDrops
     from_s: float
     to_s: float
@@ -160,13 +160,13 @@ class Feed:
 
 
 def log_arrivals(
-    vehicles: Sequence[Vehicle], *, with_truth: bool
+    vehicles: Sequence[PlannedVehicle], *, with_truth: bool
 ) -> Generator[tuple[float, int, LogSample], None, None]:
     """Fleet time of arrival, agent and sample of all vehicles in order of arrival.
 
     Without ``with_truth`` those of the truth are left out. Raises `LogError`.
     """
-    by_source: dict[int, list[Vehicle]] = {}
+    by_source: dict[int, list[PlannedVehicle]] = {}
     for vehicle in vehicles:
         by_source.setdefault(id(vehicle.source), []).append(vehicle)
     streams = [_of_log(of_source[0].source, of_source, with_truth) for of_source in by_source.values()]
@@ -183,7 +183,7 @@ def _of_truth(agent_id: int, samples: Iterable[TruthSample]) -> Iterator[tuple[f
 
 
 def _of_log(
-    source: LogSource, vehicles: list[Vehicle], with_truth: bool
+    source: LogSource, vehicles: list[PlannedVehicle], with_truth: bool
 ) -> Generator[tuple[float, int, LogSample], None, None]:
     of_system = {vehicle.survey.system_id: vehicle for vehicle in vehicles}
     for event in source.events():

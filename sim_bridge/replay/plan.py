@@ -19,7 +19,7 @@ APART_S = 6 * 3600.0
 
 
 @dataclass(frozen=True, slots=True)
-class Vehicle:
+class PlannedVehicle:
     """One vehicle of a log as an agent; fleet time is log time plus ``shift_s``."""
 
     source: LogSource
@@ -39,14 +39,14 @@ class Vehicle:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ReplayPlan:
     """The vehicles by agent, in the order of the configuration; agents without a log are not among them.
 
     ``epoch_unix_s`` is the Unix time of fleet time 0, ``None`` where no log knows the time; ``clocks`` says how the
     logs were laid side by side, for the report.
     """
 
-    vehicles: tuple[Vehicle, ...]
+    vehicles: tuple[PlannedVehicle, ...]
     epoch_unix_s: float | None
     clocks: str
 
@@ -61,7 +61,7 @@ class Plan:
         return max(vehicle.last_s for vehicle in self.vehicles)
 
 
-def make_plan(config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: dict[int, float] | None = None) -> Plan:
+def make_plan(config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: dict[int, float] | None = None) -> ReplayPlan:
     """Assign and align; raises `ReplayError`, or `LogError` from a log that cannot be read.
 
     ``unix_zero_s`` gives the Unix time of log time 0 by the index of the source, where it is known better than the
@@ -79,11 +79,11 @@ def make_plan(config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: di
     begin_s = min(zeros[k] + system.first_s for k, system in found)
     origin_s = math.floor(begin_s) - LEAD_S
     vehicles = [
-        Vehicle(sources[k], system, agent, zeros[k] - origin_s)
+        PlannedVehicle(sources[k], system, agent, zeros[k] - origin_s)
         for (k, system), agent in zip(found, agents, strict=True)
     ]
     vehicles.sort(key=lambda vehicle: config.ids.index(vehicle.agent_id))
-    return Plan(tuple(vehicles), None if epoch_s is None else origin_s, clocks)
+    return ReplayPlan(tuple(vehicles), None if epoch_s is None else origin_s, clocks)
 
 
 def _assigned(config: FleetConfig, system_ids: list[int]) -> list[int]:

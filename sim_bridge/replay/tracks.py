@@ -57,7 +57,7 @@ class TrackWriter:
         self._held = 0
 
 
-class Track:
+class WrittenTrack:
     """A written track; ``entries`` is mapped, not read."""
 
     def __init__(self, path: Path) -> None:

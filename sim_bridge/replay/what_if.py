@@ -13,7 +13,7 @@ SPELLING = "ID, ID:FROM,TO, ID:FROM, or ID:,TO with seconds from the start (nega
 
 
 @dataclass(frozen=True, slots=True)
-class Window:
+class ReplaySpan:
     """A part of a replay in seconds from its start, negative from its end; ``None`` is open."""
 
     from_s: float | None = None
@@ -35,7 +35,7 @@ class GpsDrop:
     """One agent without fixes for a while."""
 
     agent_id: int
-    window: Window
+    window: ReplaySpan
 
     @classmethod
     def parsed(cls, text: str) -> GpsDrop:
@@ -44,7 +44,7 @@ class GpsDrop:
         if match is None:
             raise ReplayError(OPTION, SPELLING, repr(text))
         bounds = [_bound(text, part) for part in match.groups()[1:]]
-        return cls(int(match.group(1)), Window(*bounds))
+        return cls(int(match.group(1)), ReplaySpan(*bounds))
 
 
 def _bound(text: str, part: str | None) -> float | None:

@@ -36,7 +36,7 @@ class SimulatorAbsent(OSError):
 
 
 @dataclass(frozen=True, slots=True)
-class Progress:
+class BridgeProgress:
     """Where the bridge is: simulators that are missing yet, for people; all there; the run has begun."""
 
     missing: tuple[str, ...] = ()
@@ -44,7 +44,7 @@ class Progress:
     begun_unix_s: float | None = None
 
 
-OnProgress = Callable[[Progress], None]
+OnProgress = Callable[[BridgeProgress], None]
 OnStep = Callable[[SitlWorld, float], None]
 """Called about a hundred times a second of the run with the world and the present time."""
 
@@ -109,12 +109,12 @@ class SitlBridge:
     async def run(self, stop: asyncio.Event, on_progress: OnProgress, on_step: OnStep | None = None) -> BridgeReport:
         """Wait for simulators and daemons, then record and range until ``stop``; raises `SimulatorAbsent`."""
         await self._simulators_there(stop, on_progress)
-        on_progress(Progress(ready=True))
+        on_progress(BridgeProgress(ready=True))
         await self._daemons_there(stop)
         if stop.is_set():
             return self.report()
         start_s = self._world.begin(time.monotonic())
-        on_progress(Progress(ready=True, begun_unix_s=start_s + self._world.unix_offset_s))
+        on_progress(BridgeProgress(ready=True, begun_unix_s=start_s + self._world.unix_offset_s))
         while not stop.is_set() and not self._lost:
             await self._step()
             now_s = time.monotonic()
@@ -139,7 +139,7 @@ class SitlBridge:
                 raise SimulatorAbsent(f"{'; '.join(missing)}; waited {limit_s:g} s: is it running there?")
             if now_s - told_s >= PROGRESS_S:
                 told_s = now_s
-                on_progress(Progress(missing))
+                on_progress(BridgeProgress(missing))
             await self._step()
 
     async def _daemons_there(self, stop: asyncio.Event) -> None:

@@ -22,7 +22,7 @@ LEAST_HDOP = 0.5
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Fix:
+class ReceiverFix:
     """What a receiver said, in SI units and degrees; ``None``, and 0 of an accuracy, are "unknown"."""
 
     t_s: float
@@ -42,7 +42,7 @@ class Fix:
     speed_sigma_mps: float | None
 
 
-def gps_sample(fix: Fix, frame: FleetFrame, flavour: str, sensors: SensorsTable) -> GpsSample | str:
+def gps_sample(fix: ReceiverFix, frame: FleetFrame, flavour: str, sensors: SensorsTable) -> GpsSample | str:
     """The sample of a fix stamped with the boot clock of an autopilot ``flavour``, or why there is none."""
     if not sensors.gps_min_fix <= fix.fix_type <= BEST_FIX_TYPE:
         return "gps: no fix"
@@ -93,7 +93,7 @@ def _sigma_m(accuracy_m: float | None, dilution: float | None) -> float | None:
     return max(sigma_m, GPS_SIGMA_FLOOR_M)
 
 
-def _speeds(fix: Fix, sensors: SensorsTable) -> tuple[tuple[float, float] | None, float | None]:
+def _speeds(fix: ReceiverFix, sensors: SensorsTable) -> tuple[tuple[float, float] | None, float | None]:
     """Ground velocity, or norm of the velocity, whichever the configuration takes."""
     speed, course, down = fix.speed_mps, fix.course_rad, fix.down_mps
     if sensors.gps_speed == "off" or speed is None or not math.isfinite(speed):

@@ -21,9 +21,9 @@ from sim_bridge.replay.logs.events import Format, LogCounts, LogEvent, LogSurvey
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import LEAD_S, make_plan
 from sim_bridge.replay.statistics import Spread, Thinned
-from sim_bridge.replay.tracks import Track, TrackWriter
+from sim_bridge.replay.tracks import TrackWriter, WrittenTrack
 from sim_bridge.replay.truth_files import TruthFile
-from sim_bridge.replay.what_if import GpsDrop, GpsDrops, Window
+from sim_bridge.replay.what_if import GpsDrop, GpsDrops, ReplaySpan
 
 FRAME = FleetFrame(47.397742, 8.545594, 489.4, True, None)
 
@@ -54,7 +54,7 @@ def test_a_track_gives_back_a_cubic_between_its_samples_and_nothing_in_gaps(tmp_
     writer.close()
     # WHEN it is read between the samples THEN positions are exact
     wanted = np.array([0.05, 1.234, 1.999, 3.0, 5.55, 99.0])
-    states = Track(path).at(wanted, max_gap_s=0.5)
+    states = WrittenTrack(path).at(wanted, max_gap_s=0.5)
     known = [0, 1, 2, 4]
     assert states[known, :3] == pytest.approx(at(wanted[known]), abs=1e-9)
     assert states[known, 3:] == pytest.approx(velocity(wanted[known]), abs=0.02)
@@ -67,10 +67,10 @@ def test_a_track_without_velocities_is_linear(tmp_path: Path) -> None:
     writer.write(0.0, (0.0, 0.0, math.nan), None)
     writer.write(0.2, (1.0, 2.0, math.nan), None)
     writer.close()
-    state = Track(tmp_path / "a.track").at(np.array([0.05]), 1.0)[0]
+    state = WrittenTrack(tmp_path / "a.track").at(np.array([0.05]), 1.0)[0]
     assert state[[0, 1, 3, 4]] == pytest.approx([0.25, 0.5, 5.0, 10.0])
     assert np.isnan(state[2])
-    assert len(Track(tmp_path / "none.track")) == 0
+    assert len(WrittenTrack(tmp_path / "none.track")) == 0
 
 
 # --- statistics ----------------------------------------------------------------------------------------------
@@ -153,7 +153,7 @@ def test_files_of_one_name_are_told_apart_by_their_folders() -> None:
 
 
 def test_an_open_window_is_infinite() -> None:
-    assert Window().resolved(0.0, 10.0) == (-math.inf, math.inf)
+    assert ReplaySpan().resolved(0.0, 10.0) == (-math.inf, math.inf)
 
 
 # --- which log is which agent --------------------------------------------------------------------------------

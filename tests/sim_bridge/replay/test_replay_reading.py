@@ -31,7 +31,7 @@ from sim_bridge.replay.logs.events import (
     TruthSample,
     UnixZero,
 )
-from sim_bridge.replay.plan import Plan, Vehicle
+from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
 from sim_bridge.replay.range_files import RangeCounts, RangeLine, read_ranges
 from sim_bridge.replay.reading import BATCH, read_beside, surveyed
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
@@ -115,14 +115,14 @@ class Nobody:
         pass
 
 
-def vehicles_of(*names: str) -> list[Vehicle]:
+def vehicles_of(*names: str) -> list[PlannedVehicle]:
     sources = [open_log(LOGS / name, frame=FRAME, sensors=SensorsTable()) for name in names]
     found = [(source, survey) for source in sources for survey in source.survey().systems.values()]
-    return [Vehicle(source, survey, k + 1, 10.0 + 0.25 * k) for k, (source, survey) in enumerate(found)]
+    return [PlannedVehicle(source, survey, k + 1, 10.0 + 0.25 * k) for k, (source, survey) in enumerate(found)]
 
 
 def feed_of(source: LogSource, to_s: float = math.inf) -> Feed:
-    plan = Plan((Vehicle(source, SYSTEM, 1, 0.0),), None, "made up")
+    plan = ReplayPlan((PlannedVehicle(source, SYSTEM, 1, 0.0),), None, "made up")
     return Feed(Inputs(plan, GpsDrops([], (1,), 0.0, 1.0), 0.0, to_s), Nobody())
 
 
@@ -132,7 +132,7 @@ def recorded(folder: Path, truth: str) -> Feed:
     vehicles = vehicles_of("copter.tlog.gz", "px4.tlog.gz", "copter.BIN.gz")
     start_s, end_s = min(v.first_s for v in vehicles), max(v.last_s for v in vehicles)
     drops = GpsDrops([GpsDrop.parsed("1:2,9")], (1, 2, 3), start_s, end_s)
-    plan = Plan(tuple(vehicles), None, "made up")
+    plan = ReplayPlan(tuple(vehicles), None, "made up")
     references = File(folder / "references")
     if truth == "of the logs":
         maker = Synthesiser({1: (2, 3), 2: (1,), 3: (1,)}, SyntheticNoise(), 4)
@@ -238,7 +238,7 @@ def test_a_full_disk_is_raised_as_it_was() -> None:
 
 def recorded_inputs() -> Inputs:
     vehicles = vehicles_of("copter.tlog.gz")
-    plan = Plan(tuple(vehicles), None, "made up")
+    plan = ReplayPlan(tuple(vehicles), None, "made up")
     return Inputs(plan, GpsDrops([], (1,), 0.0, 1.0), -math.inf, math.inf)
 
 
@@ -265,7 +265,7 @@ def test_without_a_second_process_it_is_read_here(monkeypatch: pytest.MonkeyPatc
 
 
 def test_times_are_shifted_to_fleet_time() -> None:
-    plan = Plan((Vehicle(MadeLog(3), replace(SYSTEM), 7, 5.0),), None, "made up")
+    plan = ReplayPlan((PlannedVehicle(MadeLog(3), replace(SYSTEM), 7, 5.0),), None, "made up")
     with read_beside(Feed(Inputs(plan, GpsDrops([], (7,), 0.0, 1.0), 0.0, math.inf), Nobody())) as arrivals:
         heard: list[Arrival] = list(arrivals)
     arrival_s, agent_id, sample = heard[1]

@@ -17,7 +17,7 @@ from agent.config.endpoints import parse_endpoint
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig
 from sim_bridge.autopilot.udp_autopilot import PortError
-from sim_bridge.sitl.bridge import Progress, SimulatorAbsent, SitlBridge, bridge
+from sim_bridge.sitl.bridge import BridgeProgress, SimulatorAbsent, SitlBridge, bridge
 from sim_bridge.sitl.setup import vehicle_links
 from sim_bridge.sitl.world import SitlWorld
 from sim_bridge.world.simulation import Simulation
@@ -179,7 +179,7 @@ async def test_ranges_truth_and_a_dropped_gps(tmp_path: Path) -> None:
         SessionSettings(listen=config.listen(1)), config.fleet.name, 1, config.ids, Handlers(on_sample)
     )
     session.subscribe(1, [Stream.UWB])
-    progress: list[Progress] = []
+    progress: list[BridgeProgress] = []
     truth_file = tmp_path / "truth.npz"
     async with simulators_of(config):
         daemons = {agent: await Daemon.at(link.daemon.port) for agent, link in links.items()}
@@ -221,7 +221,7 @@ def request(agent: int, message_id: int, rate_hz: float) -> Any:
 
 async def test_absent_simulators_are_named_with_their_addresses() -> None:
     config = bridge_config(sitl={"appear_timeout_s": 0.3})
-    progress: list[Progress] = []
+    progress: list[BridgeProgress] = []
     with pytest.raises(SimulatorAbsent) as absent:
         await asyncio.wait_for(bridge(config, on_progress=progress.append), WAIT_S)
     for link in vehicle_links(config).values():
@@ -265,7 +265,7 @@ async def test_a_simulator_that_dies_ends_the_run_and_is_named() -> None:
     try:
         begun = asyncio.Event()
 
-        def on_progress(step: Progress) -> None:
+        def on_progress(step: BridgeProgress) -> None:
             if step.begun_unix_s is not None:
                 begun.set()
 

@@ -16,7 +16,7 @@ from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Triple
 from sim_bridge.replay.logs.dataflash.records import Values
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
-from sim_bridge.replay.logs.gps_samples import Fix, gps_sample, imu_sample
+from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
 
 WANTED: dict[str, tuple[str, ...]] = {
     "PARM": ("TimeUS", "Name", "Value"),
@@ -197,7 +197,7 @@ class DataflashVehicle:
             t_s += values["SMS"] * 1e-3 - values["TimeUS"] * 1e-6
             if not 0.0 <= now_s - t_s <= MAX_GPS_AGE_S:
                 return self._skip("gps: wrong time")
-        fix = Fix(
+        fix = ReceiverFix(
             t_s=t_s,
             fix_type=values["Status"],
             lat_deg=point.lat_deg,

@@ -82,7 +82,7 @@ Placed = tuple[float, Source, int, bytes, float | None]
 
 
 @dataclass(slots=True)
-class _Heard:
+class _SourceSurvey:
     """What the survey collects of one source."""
 
     first_s: float
@@ -161,12 +161,12 @@ class TlogSource(SurveyedLog):
     def _made_survey(self) -> LogSurvey:
         counts = LogCounts()
         repair = StampRepair(counts.notes)
-        heard: dict[Source, _Heard] = {}
+        heard: dict[Source, _SourceSurvey] = {}
         first_s, last_s = 0.0, 0.0
         for arrival_s, source, message_id, payload, boot_s in self._placed(counts, repair):
             found = heard.get(source)
             if found is None:
-                found = heard[source] = _Heard(arrival_s)
+                found = heard[source] = _SourceSurvey(arrival_s)
             found.last_s = last_s = arrival_s
             found.messages[_NAMED[message_id]] += 1
             if boot_s is not None:
@@ -203,23 +203,23 @@ def _boot_s(message_id: int, payload: bytes) -> float | None:
 # --- what the survey takes out of a message ------------------------------------------------------------------
 
 
-def _heartbeat(found: _Heard, message: Message) -> None:
+def _heartbeat(found: _SourceSurvey, message: Message) -> None:
     if message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type != mavlink.MAV_TYPE_GCS:
         flavour: Flavour = FLAVOURS.get(message.autopilot, "other")  # type: ignore[assignment]
         found.flavours[flavour] += 1
 
 
-def _gps_raw_int(found: _Heard, message: Message) -> None:
+def _gps_raw_int(found: _SourceSurvey, message: Message) -> None:
     if found.first_fix is None and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
         found.first_fix = _point(message.lat, message.lon, message.alt)
 
 
-def _origin(found: _Heard, message: Message) -> None:
+def _origin(found: _SourceSurvey, message: Message) -> None:
     if found.origin is None:
         found.origin = _point(message.latitude, message.longitude, message.altitude)
 
 
-def _home(found: _Heard, message: Message) -> None:
+def _home(found: _SourceSurvey, message: Message) -> None:
     if found.home is None:
         found.home = _point(message.latitude, message.longitude, message.altitude)
 
@@ -241,7 +241,7 @@ _TAKE = {
 # --- what the survey concludes -------------------------------------------------------------------------------
 
 
-def _autopilots(heard: dict[Source, _Heard]) -> dict[int, Source]:
+def _autopilots(heard: dict[Source, _SourceSurvey]) -> dict[int, Source]:
     """The autopilot's source of each system: the one with most heartbeats."""
     chosen: dict[int, Source] = {}
     for source, found in sorted(heard.items()):
@@ -254,7 +254,7 @@ def _autopilots(heard: dict[Source, _Heard]) -> dict[int, Source]:
     return chosen
 
 
-def _system(system_id: int, found: _Heard) -> SystemSurvey:
+def _system(system_id: int, found: _SourceSurvey) -> SystemSurvey:
     return SystemSurvey(
         system_id=system_id,
         flavour=found.flavours.most_common(1)[0][0] if found.flavours else "unknown",
@@ -281,7 +281,7 @@ def _clock_notes(clock: BootClockFit) -> Counter[str]:
     )
 
 
-def _estimate_frame(found: _Heard) -> Literal["fleet", "own", "none"]:
+def _estimate_frame(found: _SourceSurvey) -> Literal["fleet", "own", "none"]:
     local, everywhere = ESTIMATES
     if found.origin is not None and found.messages[local]:
         return "fleet"
@@ -297,7 +297,7 @@ def _unix(repair: StampRepair) -> UnixZero:
     return UnixZero(zero_s, HOST_CLOCK_SIGMA_S, "host")
 
 
-def _what_else(heard: dict[Source, _Heard], counts: LogCounts) -> str:
+def _what_else(heard: dict[Source, _SourceSurvey], counts: LogCounts) -> str:
     """Words for what a log without a vehicle holds instead."""
     if heard:
         names: defaultdict[str, int] = defaultdict(int)

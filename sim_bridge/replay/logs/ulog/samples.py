@@ -16,8 +16,8 @@ from agent.config.tables import SensorsTable
 from agent.sensing.frames import FleetFrame, normalised
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Quaternion, Triple
 from sim_bridge.replay.logs.events import LogSample, TruthSample
-from sim_bridge.replay.logs.gps_samples import Fix, gps_sample, imu_sample
-from sim_bridge.replay.logs.ulog.tables import Table
+from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
+from sim_bridge.replay.logs.ulog.tables import TopicTable
 
 _QUATERNION = ("q[0]", "q[1]", "q[2]", "q[3]")
 _IMU = (
@@ -52,7 +52,7 @@ Timed = tuple[float, LogSample]
 """A sample and the log time of its publication."""
 
 
-def _sample_times_us(table: Table) -> NDArray[np.int64]:
+def _sample_times_us(table: TopicTable) -> NDArray[np.int64]:
     """When the values were taken: ``timestamp_sample`` where it is there and can be true."""
     given = table.columns.get("timestamp_sample")
     if given is None:
@@ -62,7 +62,7 @@ def _sample_times_us(table: Table) -> NDArray[np.int64]:
     return np.where((age >= 0) & (age <= MAX_AGE_US), taken, table.timestamp_us)
 
 
-def _rows(table: Table, values: NDArray[np.float64]) -> Iterator[tuple[float, float, list[float]]]:
+def _rows(table: TopicTable, values: NDArray[np.float64]) -> Iterator[tuple[float, float, list[float]]]:
     """Publication, instant of the value (log time in s) and values, a few rows in Python's own types at a time."""
     taken_us = _sample_times_us(table)
     for start in range(0, len(table), ROWS):
@@ -75,7 +75,7 @@ def _rows(table: Table, values: NDArray[np.float64]) -> Iterator[tuple[float, fl
         )
 
 
-def imu_samples(table: Table, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
+def imu_samples(table: TopicTable, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
     """``sensor_combined``: gyro at the record's stamp; the accelerometer's few microseconds beside it are left."""
     values = table.stack(*_IMU)
     if values is None:
@@ -89,7 +89,7 @@ def imu_samples(table: Table, sensors: SensorsTable, skipped: Counter[str]) -> I
             skipped[sample] += 1
 
 
-def attitude_samples(table: Table, skipped: Counter[str]) -> Iterator[Timed]:
+def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed]:
     """``vehicle_attitude``."""
     values = table.stack(*_QUATERNION)
     if values is None:
@@ -103,7 +103,7 @@ def attitude_samples(table: Table, skipped: Counter[str]) -> Iterator[Timed]:
             yield arrival_s, AttitudeSample(t_s, quaternion)
 
 
-def gps_samples(table: Table, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
+def gps_samples(table: TopicTable, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
     """``vehicle_gps_position`` or ``sensor_gps``; ``eph``, ``epv`` are 1-sigma in m."""
     where = degrees(table)
     if where is None or "fix_type" not in table.columns:
@@ -113,7 +113,7 @@ def gps_samples(table: Table, frame: FleetFrame, sensors: SensorsTable, skipped:
     columns = [table.columns.get(name, np.full(len(table), np.nan)) for name in others]
     values = np.column_stack((where, *(np.asarray(column, np.float64) for column in columns)))
     for arrival_s, t_s, row in _rows(table, values):
-        fix = Fix(
+        fix = ReceiverFix(
             t_s=t_s,
             fix_type=int(row[4]),
             lat_deg=row[0],
@@ -136,7 +136,7 @@ def gps_samples(table: Table, frame: FleetFrame, sensors: SensorsTable, skipped:
             skipped[sample] += 1
 
 
-def degrees(table: Table) -> NDArray[np.float64] | None:
+def degrees(table: TopicTable) -> NDArray[np.float64] | None:
     """Latitude, longitude (deg), height above mean sea level and above the ellipsoid (m), ``(m, 4)``."""
     where = table.stack("latitude_deg", "longitude_deg", "altitude_msl_m", "altitude_ellipsoid_m")
     if where is not None:
@@ -145,7 +145,7 @@ def degrees(table: Table) -> NDArray[np.float64] | None:
     return None if whole is None else whole * (FIRMWARE_BEFORE_DEGREES, FIRMWARE_BEFORE_DEGREES, 1e-3, 1e-3)
 
 
-def estimate_samples(table: Table, frame: FleetFrame, skipped: Counter[str]) -> Iterator[Timed]:
+def estimate_samples(table: TopicTable, frame: FleetFrame, skipped: Counter[str]) -> Iterator[Timed]:
     """``vehicle_local_position`` in the fleet's frame, each record by its own reference.
 
     Records without reference are about the autopilot's own origin, and left out if others have one.
@@ -170,7 +170,7 @@ def estimate_samples(table: Table, frame: FleetFrame, skipped: Counter[str]) -> 
 
 
 def truth_samples(
-    table: Table, attitude: Table | None, frame: FleetFrame, skipped: Counter[str]
+    table: TopicTable, attitude: TopicTable | None, frame: FleetFrame, skipped: Counter[str]
 ) -> Iterator[Timed]:
     """``vehicle_local_position_groundtruth`` with the attitude of the same instant."""
     values = table.stack(*_MOTION, *_REFERENCE)
@@ -188,7 +188,7 @@ def truth_samples(
         yield arrival_s, TruthSample(t_s, position, (row[3], row[4], row[5]), _unit(row[9:]))
 
 
-def _beside(table: Table, attitude: Table | None) -> NDArray[np.float64]:
+def _beside(table: TopicTable, attitude: TopicTable | None) -> NDArray[np.float64]:
     """The attitude nearest to each record ``(m, 4)``; NaN where none is near."""
     missing = np.full((len(table), 4), np.nan)
     quaternions = None if attitude is None else attitude.stack(*_QUATERNION)

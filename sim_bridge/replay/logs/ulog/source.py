@@ -36,7 +36,7 @@ from sim_bridge.replay.logs.ulog.samples import (
     imu_samples,
     truth_samples,
 )
-from sim_bridge.replay.logs.ulog.tables import MAGIC, Table, Tables, load_tables
+from sim_bridge.replay.logs.ulog.tables import MAGIC, Tables, TopicTable, load_tables
 
 __all__ = ["MAGIC", "UlogSource"]
 
@@ -117,13 +117,13 @@ def _arrival(timed: Timed) -> float:
     return timed[0]
 
 
-def _gps_table(tables: Tables) -> Table | None:
+def _gps_table(tables: Tables) -> TopicTable | None:
     """The topic with most fixes: firmware logs the receiver's and the blended one, each at its own rate."""
     found = [tables.topics[name] for name in GPS_TOPICS if name in tables.topics]
     return max(found, key=len) if found else None
 
 
-def _reference(local: Table) -> GeodeticPoint | None:
+def _reference(local: TopicTable) -> GeodeticPoint | None:
     """The first origin of the local frame."""
     where = local.stack("ref_lat", "ref_lon", "ref_alt")
     if where is None:
@@ -137,7 +137,7 @@ def _reference(local: Table) -> GeodeticPoint | None:
     return GeodeticPoint(lat_deg, lon_deg, alt_m) if abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0 else None
 
 
-def _first_fix(gps: Table | None) -> GeodeticPoint | None:
+def _first_fix(gps: TopicTable | None) -> GeodeticPoint | None:
     if gps is None or "fix_type" not in gps.columns:
         return None
     where = degrees(gps)

@@ -42,7 +42,7 @@ Column = NDArray[Any]
 
 
 @dataclass(frozen=True, slots=True)
-class Table:
+class TopicTable:
     """Records of one topic in ascending ``timestamp`` (us of boot time, int64), columns by field name."""
 
     name: str
@@ -63,7 +63,7 @@ class Table:
 class Tables:
     """What was kept of a log: the first instance of each topic, the parameters, and its start."""
 
-    topics: Mapping[str, Table]
+    topics: Mapping[str, TopicTable]
     parameters: Mapping[str, float]
 
 
@@ -110,7 +110,7 @@ def load_tables(path: Path, wanted: Mapping[str, tuple[str, ...]], skipped: Coun
         skipped["damaged stretches of the file (at least one)"] += 1
     if log.dropouts:
         skipped["dropouts of the logger"] += len(log.dropouts)
-    topics: dict[str, Table] = {}
+    topics: dict[str, TopicTable] = {}
     while log.data_list:  # one by one, so that both forms of a topic are in memory together only once
         data = log.data_list.pop()
         if data.multi_id == 0:
@@ -134,7 +134,7 @@ def _parsed(ulog: Any, path: Path, file: Unpacked, names: list[str]) -> Any:
         raise LogError(path, "a readable .ulg", str(error)) from None
 
 
-def _table(name: str, data: Mapping[str, Column], fields: tuple[str, ...], skipped: Counter[str]) -> Table | None:
+def _table(name: str, data: Mapping[str, Column], fields: tuple[str, ...], skipped: Counter[str]) -> TopicTable | None:
     stamps = data.get("timestamp")
     if stamps is None or stamps.dtype != np.uint64:
         skipped[f"{name}: its description is damaged"] += 1
@@ -151,7 +151,7 @@ def _table(name: str, data: Mapping[str, Column], fields: tuple[str, ...], skipp
         for field in fields
         if field in data and data[field].dtype.kind in "fiub"
     }
-    return Table(name, stamps[kept].astype(np.int64), columns)
+    return TopicTable(name, stamps[kept].astype(np.int64), columns)
 
 
 def in_order(stamps_us: NDArray[np.int64]) -> NDArray[np.int64]:

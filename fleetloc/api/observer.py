@@ -10,7 +10,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from fleetloc.monitor.listener import Listener
+from fleetloc.monitor.listener import FleetListener
 from fleetloc.whole_config import load_whole
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.report_body import Diagnostics
@@ -50,7 +50,7 @@ class FleetObserver:
         Messages that are not taken wait, at most ``most_waiting`` of them; then the oldest go.
         """
         config = load_whole(config_file)
-        self._listener = Listener(config, Path(config_file).parent, self._on_message, self._on_presence, endpoints)
+        self._listener = FleetListener(config, Path(config_file).parent, self._on_message, self._on_presence, endpoints)
         self._waiting: deque[Heard] = deque(maxlen=most_waiting)
         self._news = asyncio.Event()
         self._present: set[int] = set()

@@ -31,14 +31,14 @@ def monitor(
 
     from agent.config.reading import load_config
     from fleetloc.errors import InputError
-    from fleetloc.monitor.run import Monitor
+    from fleetloc.monitor.run import LiveMonitor
 
     if duration_s is not None and not duration_s > 0:
         raise InputError("--duration", "", "seconds greater than 0", f"{duration_s:g}")
     fleet = load_config(config, list(overrides or ()), profiles or ())
 
     async def show() -> None:
-        shown = Monitor(fleet, config.parent, endpoints=connect or (), web=web, terminal=table)
+        shown = LiveMonitor(fleet, config.parent, endpoints=connect or (), web=web, terminal=table)
         await shown.run(duration_s)
 
     asyncio.run(show())

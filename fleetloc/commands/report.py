@@ -33,7 +33,7 @@ def report(
     from fleetloc.errors import InputError
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files
-    from fleetloc.run.fleet_run import Outcome
+    from fleetloc.run.fleet_run import RunOutcome
 
     fleet = load_config(config, overrides or (), profiles or ())
     records = [run_files.record_path(directory, agent_id) for agent_id in fleet.ids]
@@ -44,7 +44,7 @@ def report(
         if not needed.is_file():
             expected = f"{needed.name}, which `fleetloc sim --out` and `fleetloc agent --out` write"
             raise InputError(str(directory), "", expected, "no such file")
-    write_report(fleet, directory, Outcome(), json_file, "live")
+    write_report(fleet, directory, RunOutcome(), json_file, "live")
     typer.echo(f"report: {directory / run_files.REPORT_HTML}")
 
 

@@ -26,7 +26,7 @@ OnPresence = Callable[[int, bool, float], None]
 """(agent id, whether it is there, monotonic clock in s)."""
 
 
-class Listener:
+class FleetListener:
     """Listens to all drones of a fleet; what is well-formed and from whom it says goes to ``on_message``.
 
     ``endpoints`` are dialled instead of those that the configuration gives the drones; ``base`` is the folder of the

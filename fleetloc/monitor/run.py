@@ -14,7 +14,7 @@ from rich.live import Live
 
 from agent.config.tables import FleetConfig
 from fleetloc.monitor import table
-from fleetloc.monitor.listener import Listener
+from fleetloc.monitor.listener import FleetListener
 from fleetloc.monitor.monitor_table import monitor_table
 from fleetloc.monitor.picture import FleetPicture
 from fleetloc.monitor.views import Picture
@@ -32,7 +32,7 @@ TRACKS_TIMEOUT_S = 5.0
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 
-class Monitor:
+class LiveMonitor:
     """Made for one `run`; ``picture`` is there to be looked at."""
 
     def __init__(
@@ -51,7 +51,7 @@ class Monitor:
         self._web, self._terminal = web, terminal
         self._console = console or Console()
         self.picture = FleetPicture(config)
-        self._listener = Listener(config, base, self._on_message, self.picture.on_presence, endpoints)
+        self._listener = FleetListener(config, base, self._on_message, self.picture.on_presence, endpoints)
         self._board = Board()
         self._where = ""
         self._stop = asyncio.Event()

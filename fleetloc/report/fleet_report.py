@@ -16,10 +16,10 @@ from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import rms
 from fleetloc.extras import is_installed, sentence
 from fleetloc.output import print_table, write_json
-from fleetloc.report.fleet_results import Floats, Results, Track, load_results
+from fleetloc.report.fleet_results import AgentTrack, FleetResults, Floats, load_results
 from fleetloc.report.report_html import page
 from fleetloc.run import run_files
-from fleetloc.run.fleet_run import Outcome
+from fleetloc.run.fleet_run import RunOutcome
 from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
@@ -30,7 +30,7 @@ SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "range": "uwb"}
 
 
 def write_report(
-    config: FleetConfig, directory: Path, outcome: Outcome, json_file: Path | None, mode: str
+    config: FleetConfig, directory: Path, outcome: RunOutcome, json_file: Path | None, mode: str
 ) -> dict[str, Any]:
     """Read the run's files, write ``report.json`` and ``report.html``, print the figures; returns them."""
     results = load_results(config, directory)
@@ -45,7 +45,7 @@ def write_report(
 
 
 def report_figures(
-    config: FleetConfig, results: Results, directory: Path, outcome: Outcome, mode: str
+    config: FleetConfig, results: FleetResults, directory: Path, outcome: RunOutcome, mode: str
 ) -> dict[str, Any]:
     """The content of ``report.json``; units are in the names, what is not known is null."""
     agents = []
@@ -79,7 +79,7 @@ def report_figures(
     }
 
 
-def _of_track(track: Track) -> dict[str, Any]:
+def _of_track(track: AgentTrack) -> dict[str, Any]:
     known, settled = track.known, track.known & (track.time_s >= SETTLED_S)
     return {
         "id": track.agent_id,
@@ -144,7 +144,7 @@ def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:
     }
 
 
-def _of_fleet(results: Results, agents: list[dict[str, Any]]) -> dict[str, Any]:
+def _of_fleet(results: FleetResults, agents: list[dict[str, Any]]) -> dict[str, Any]:
     expected, on_time = (sum(agent[key] for agent in agents) for key in ("ticks_expected", "ticks_on_time"))
     packets = {key: sum(agent["packets"][key] for agent in agents) for key in ("sent", "received", "lost", "late")}
     rejected: Counter[str] = Counter()

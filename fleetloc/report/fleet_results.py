@@ -25,7 +25,7 @@ NO_STATISTICS = np.nan
 
 
 @dataclass(frozen=True, slots=True)
-class Track:
+class AgentTrack:
     """One agent's estimates at K ticks, those without an estimate (status "no data") left out of the errors.
 
     ``time_s`` ``(K,)`` since the start of the truth, ``own_m`` and ``own_sigma_m`` ``(K, 3)`` NED position and
@@ -53,25 +53,25 @@ class Track:
 
 
 @dataclass(frozen=True, slots=True)
-class Results:
+class FleetResults:
     """A run against its truth."""
 
     truth: Truth
     start_unix_s: float
     duration_s: float
     period_s: float
-    tracks: tuple[Track, ...]
+    tracks: tuple[AgentTrack, ...]
 
 
-def load_results(config: FleetConfig, directory: Path) -> Results:
+def load_results(config: FleetConfig, directory: Path) -> FleetResults:
     """Read the truth and every record; raises `TruthError` or `RecordError` naming the file that cannot be used."""
     truth = load_truth(directory / run_files.TRUTH)
     start_unix_s, end_unix_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
     tracks = tuple(_track(config, directory, agent_id, truth) for agent_id in config.ids)
-    return Results(truth, start_unix_s, end_unix_s - start_unix_s, config.fleet.period_s, tracks)
+    return FleetResults(truth, start_unix_s, end_unix_s - start_unix_s, config.fleet.period_s, tracks)
 
 
-def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) -> Track:
+def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) -> AgentTrack:
     period_s, epoch_s = config.fleet.period_s, config.fleet.epoch_unix_s
     start_s, end_s = (float(truth.time_unix_s[i]) - epoch_s for i in (0, -1))
     paths = run_files.records(directory, agent_id)
@@ -89,7 +89,7 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     covariance_diagonal = np.array([covariance_of(entry, len(config.ids)).diagonal()[own] for entry in entries])
     latency_s = entries["published_s"] - entries["t_s"] - period_s
     first_tick = int(np.ceil((start_s - ROUNDING_S) / period_s))
-    return Track(
+    return AgentTrack(
         agent_id=agent_id,
         ticks_expected=max(int(np.floor((end_s + ROUNDING_S) / period_s)) - first_tick, 0),
         records=len(paths),

@@ -24,7 +24,7 @@ ALL, SETTLED = "all", "after_10s"
 
 
 @dataclass(frozen=True, slots=True)
-class Results:
+class ReplayResults:
     """A replay against what it can be compared with, by agent."""
 
     compared: dict[int, Compared]
@@ -34,7 +34,7 @@ class Results:
     """Fleet time of the first estimate; ``None`` where there never was one."""
 
 
-def load_results(prepared: Prepared, directory: Path) -> Results:
+def load_results(prepared: Prepared, directory: Path) -> ReplayResults:
     """Compare the records in a folder with the tracks beside them, agent by agent."""
     config, layout = prepared.config, Layout(prepared.config.ids)
     agents = [vehicle.agent_id for vehicle in prepared.inputs.plan.vehicles]
@@ -52,7 +52,7 @@ def load_results(prepared: Prepared, directory: Path) -> Results:
         compared[agent_id] = compare(
             record, layout, agent_id, references, phases[agent_id], config.fleet.period_s
         )
-    return Results(compared, references, phases, first_s)
+    return ReplayResults(compared, references, phases, first_s)
 
 
 def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
@@ -68,7 +68,7 @@ def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
     return phases
 
 
-def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> dict[str, Any]:
+def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResults) -> dict[str, Any]:
     """The content of ``report.json`` but for how long it all took; units are in the names, what is not known is null.
 
     Times are seconds from the start of the logs.
@@ -113,7 +113,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: Results) -> 
     }
 
 
-def _of_agent(prepared: Prepared, replayed: Replayed, results: Results, agent_id: int) -> dict[str, Any]:
+def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, agent_id: int) -> dict[str, Any]:
     compared, counters = results.compared[agent_id], Counter(replayed.counts.agents[agent_id])
     plan = prepared.inputs.plan
     vehicle = next(v for v in plan.vehicles if v.agent_id == agent_id)

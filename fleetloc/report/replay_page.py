@@ -6,7 +6,7 @@ from html import escape
 from typing import Any
 
 from fleetloc.extras import is_installed, sentence
-from fleetloc.report.replay_figures import Results
+from fleetloc.report.replay_figures import ReplayResults
 from fleetloc.report.replay_tables import cautions, error_table, log_table
 from fleetloc.report.report_html import CSS
 from fleetloc.report.style import NO_PLOTS, colour
@@ -38,7 +38,7 @@ def page(prepared: Prepared, sections: list[Section], figures: dict[str, Any]) -
 
 
 def drawn_sections(
-    prepared: Prepared, replayed: Replayed, results: Results, figures: dict[str, Any]
+    prepared: Prepared, replayed: Replayed, results: ReplayResults, figures: dict[str, Any]
 ) -> list[Section]:
     """Tables and plots of a page, which is most of the work on it; tables only without the plotting library."""
     tables = [
@@ -50,7 +50,7 @@ def drawn_sections(
     return tables + _plots(prepared, replayed, results, figures) if is_installed("report") else tables
 
 
-def _plots(prepared: Prepared, replayed: Replayed, results: Results, figures: dict[str, Any]) -> list[Section]:
+def _plots(prepared: Prepared, replayed: Replayed, results: ReplayResults, figures: dict[str, Any]) -> list[Section]:
     from fleetloc.report import replay_plots
     from fleetloc.report.report_plots import packets
 

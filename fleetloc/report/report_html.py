@@ -11,7 +11,7 @@ from typing import Any
 
 from agent.config.tables import FleetConfig
 from fleetloc.extras import is_installed, sentence
-from fleetloc.report.fleet_results import Results
+from fleetloc.report.fleet_results import FleetResults
 from fleetloc.report.style import NO_PLOTS
 from sim_bridge.world.sim_table import sim_table
 
@@ -38,7 +38,7 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
-def page(config: FleetConfig, results: Results, figures: dict[str, Any]) -> str:
+def page(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) -> str:
     """The whole page of a run; ``figures`` is the content of ``report.json``."""
     name, fleet = escape(config.fleet.name), figures["fleet"]
     body = "\n".join(
@@ -53,7 +53,7 @@ def page(config: FleetConfig, results: Results, figures: dict[str, Any]) -> str:
     )
 
 
-def _drawn(config: FleetConfig, results: Results, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
+def _drawn(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
     """Title, note and SVG of each plot; none where the plotting library is missing."""
     if not is_installed("report"):
         return []

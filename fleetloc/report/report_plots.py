@@ -17,7 +17,7 @@ from matplotlib.ticker import FuncFormatter, NullFormatter
 from agent.config.tables import FleetConfig
 from estimators.integrity.consistency import average_nees_band
 from estimators.model.layout import STATES_PER_AGENT
-from fleetloc.report.fleet_results import Floats, Results, Track, unbroken
+from fleetloc.report.fleet_results import AgentTrack, FleetResults, Floats, unbroken
 from fleetloc.report.style import STYLE, colour
 from sim_bridge.world.sim_table import sim_table
 
@@ -45,7 +45,7 @@ def styled(draw: Drawing[Given]) -> Callable[Given, str]:
 
 
 @styled
-def trajectories(results: Results) -> Figure:
+def trajectories(results: FleetResults) -> Figure:
     """Top view and height over time: the truth pale and wide, what each drone believes of itself thin on top."""
     figure = figure_of(4.6)
     above, beside = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.25)})
@@ -69,7 +69,7 @@ def trajectories(results: Results) -> Figure:
 
 
 @styled
-def errors(config: FleetConfig, results: Results) -> Figure:
+def errors(config: FleetConfig, results: FleetResults) -> Figure:
     """Own position error per axis within its 3-sigma band, one row per drone; GPS outages are shaded."""
     count = len(results.tracks)
     figure = figure_of(0.6 + 1.7 * count)
@@ -93,7 +93,7 @@ def errors(config: FleetConfig, results: Results) -> Figure:
 
 
 @styled
-def consistency(results: Results) -> Figure:
+def consistency(results: FleetResults) -> Figure:
     """NEES of the fleet state over its dimension, logarithmic, with the band that holds 95 % of samples."""
     figure = figure_of(3.2)
     axes = figure.subplots()
@@ -110,7 +110,7 @@ def consistency(results: Results) -> Figure:
 
 
 @styled
-def timing(results: Results) -> Figure:
+def timing(results: FleetResults) -> Figure:
     """When each tick's estimate was out, against its deadline, and how the computing times are distributed."""
     figure = figure_of(3.4)
     over_time, distribution = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1.6, 1)})
@@ -181,14 +181,14 @@ def _svg(figure: Figure) -> str:
     return re.sub(r' (?:width|height)="[\d.]+pt"', "", text[text.index("<svg") :], count=2)
 
 
-def _columns(track: Track, results: Results, *values: Floats) -> tuple[Floats, ...]:
+def _columns(track: AgentTrack, results: FleetResults, *values: Floats) -> tuple[Floats, ...]:
     """Time and the columns of values where there was an estimate, with gaps at missing ticks."""
     known = track.known
     flat = [column for value in values for column in (value[known].T if value.ndim > 1 else (value[known],))]
     return unbroken(track.time_s[known], *flat, gap_s=GAPS * results.period_s)
 
 
-def _error_limit_m(track: Track, axes: slice) -> float:
+def _error_limit_m(track: AgentTrack, axes: slice) -> float:
     """Half height of the plots of some axes: nearly all of the settled run, cut where it is much wider."""
     settled = track.known & (track.time_s >= min(SETTLING_S, track.time_s.max(initial=0) / 2))
     if not settled.any():

@@ -16,7 +16,7 @@ import zenoh
 
 from agent.config.tables import FleetConfig
 from fleetloc.errors import EnvironmentFault, InputError
-from fleetloc.monitor.listener import Listener
+from fleetloc.monitor.listener import FleetListener
 from fleetloc.ros2.odometry import (
     attachment,
     encode_odometry,
@@ -136,7 +136,7 @@ async def run(
         loop.add_signal_handler(number, stop.set)
     publisher = await asyncio.to_thread(Ros2Publisher, config, settings)
     try:
-        listener = Listener(config, base, publisher.on_message, lambda *_: None, endpoints)
+        listener = FleetListener(config, base, publisher.on_message, lambda *_: None, endpoints)
         await listener.open()
         say(f"publishing /{settings.namespace}/odom to {settings.router}")
         try:

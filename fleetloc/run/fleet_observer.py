@@ -36,7 +36,7 @@ class Observed:
         self.diagnostics = diagnostics
 
 
-class FleetObserver:
+class RunObserver:
     """Listens to the estimates and diagnostics of every agent; ``agents`` by id."""
 
     def __init__(self, config: FleetConfig, base: Path, on_presence: Callable[[], None]) -> None:

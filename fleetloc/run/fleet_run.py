@@ -17,7 +17,7 @@ from agent.config.tables import FleetConfig
 from agent.exit_codes import ExitCode
 from fleetloc.errors import BAD_INPUT, REFUSED, FleetlocError
 from fleetloc.run import live_table, run_files
-from fleetloc.run.fleet_observer import FleetObserver
+from fleetloc.run.fleet_observer import RunObserver
 from fleetloc.run.live_truth import LiveTruth
 from fleetloc.run.processes import Child, cpu_time_s, resident_mb, stop_all
 from sim_bridge.world.sim_table import sim_table
@@ -66,7 +66,7 @@ class Use:
 
 
 @dataclass(slots=True)
-class Outcome:
+class RunOutcome:
     """What the files in the run's folder do not tell."""
 
     wall_s: float = 0.0
@@ -99,13 +99,13 @@ class FleetRun:
         )
         self._stop = asyncio.Event()
         self._changed = asyncio.Event()
-        self._observer = FleetObserver(config, out, self._changed.set)
+        self._observer = RunObserver(config, out, self._changed.set)
         self._truth = LiveTruth()
-        self._outcome = Outcome(use={agent_id: Use() for agent_id in config.ids})
+        self._outcome = RunOutcome(use={agent_id: Use() for agent_id in config.ids})
         self._seen_dead: set[str] = set()
         self._flying_since_s: float | None = None
 
-    async def fly(self) -> Outcome:
+    async def fly(self) -> RunOutcome:
         """Start everything, wait for the end of the simulated time or a signal, stop everything.
 
         Raises `RunFailed` if a process cannot begin or the simulator dies; no child outlives the call.

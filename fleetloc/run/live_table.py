@@ -11,7 +11,7 @@ from rich.text import Text
 
 from agent.config.tables import FleetConfig
 from estimators.model.layout import Layout, position
-from fleetloc.run.fleet_observer import FleetObserver, Observed
+from fleetloc.run.fleet_observer import Observed, RunObserver
 from fleetloc.run.live_truth import LiveTruth
 
 STALE_S = 1.0
@@ -41,7 +41,7 @@ class Row:
 
 
 def rows(
-    config: FleetConfig, observer: FleetObserver, truth: LiveTruth, ended: dict[int, str], now_s: float
+    config: FleetConfig, observer: RunObserver, truth: LiveTruth, ended: dict[int, str], now_s: float
 ) -> list[Row]:
     """The present picture; ``ended`` says why a daemon is no more, ``now_s`` is the monotonic clock."""
     return [

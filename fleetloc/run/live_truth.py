@@ -18,7 +18,7 @@ PERIOD_S = 0.1
 KEPT = 300
 
 
-class TruthSample(msgspec.Struct, frozen=True):
+class TruePlaces(msgspec.Struct, frozen=True):
     """Where every agent truly was, NED metres."""
 
     time_unix_s: float
@@ -37,7 +37,7 @@ class TruthWriter:
             return
         self._next_s = simulation.now + PERIOD_S
         positions = tuple((float(n), float(e), float(d)) for n, e, d in simulation.world.position_m)
-        sample = TruthSample(simulation.now + simulation.unix_offset_s, positions)
+        sample = TruePlaces(simulation.now + simulation.unix_offset_s, positions)
         sys.stdout.buffer.write(msgspec.json.encode(sample) + b"\n")
         sys.stdout.buffer.flush()
 
@@ -46,12 +46,12 @@ class LiveTruth:
     """The samples of the last half minute."""
 
     def __init__(self) -> None:
-        self._samples: deque[TruthSample] = deque(maxlen=KEPT)
+        self._samples: deque[TruePlaces] = deque(maxlen=KEPT)
 
     def on_line(self, line: bytes) -> bool:
         """Take in a line; false if it is none of ours."""
         try:
-            self._samples.append(msgspec.json.decode(line, type=TruthSample))
+            self._samples.append(msgspec.json.decode(line, type=TruePlaces))
         except msgspec.DecodeError:
             return False
         return True

@@ -13,13 +13,13 @@ from agent.outputs import EstimateReady
 from estimators.factory import make_estimator
 from fleetloc.output import progress_bar
 from fleetloc.run import run_files
-from fleetloc.run.fleet_run import Outcome
+from fleetloc.run.fleet_run import RunOutcome
 from sim_bridge.virtual.fleet_lockstep import FleetLockstep
 from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
 
-def fly_in_lockstep(config: FleetConfig, directory: Path) -> Outcome:
+def fly_in_lockstep(config: FleetConfig, directory: Path) -> RunOutcome:
     """Fly the scenario and write truth and records; there is no computing time in virtual time, it is given as 0."""
     fleet = config.fleet
     recorders = {
@@ -54,4 +54,4 @@ def fly_in_lockstep(config: FleetConfig, directory: Path) -> Outcome:
     lives = {
         agent_id: [Diagnostics(agent_id, "", counters=counters)] for agent_id, counters in report.counters.items()
     }
-    return Outcome(lives=lives)
+    return RunOutcome(lives=lives)

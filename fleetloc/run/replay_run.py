@@ -109,7 +109,7 @@ class ReferenceTracks:
                 stack.callback(track.close)
 
 
-class Results:
+class ReplayWriter:
     """Writes the agents' estimates down, and notes what the cores know of their sensors' latency."""
 
     def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
@@ -151,7 +151,7 @@ def run_replay(prepared: Prepared, directory: Path) -> Replayed:
     config, inputs = prepared.config, prepared.inputs
     agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
     feed = Feed(inputs, ReferenceTracks(directory, agents))
-    results = Results(directory, config, agents)
+    results = ReplayWriter(directory, config, agents)
     replay = Replay(config, feed, make_estimator, results.on_estimate)
     gc.collect()
     gc.freeze()  # full collections over all modules would take a tenth of the time

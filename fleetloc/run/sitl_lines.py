@@ -8,7 +8,7 @@ import time
 import msgspec
 import numpy as np
 
-from fleetloc.run.live_truth import PERIOD_S, TruthSample
+from fleetloc.run.live_truth import PERIOD_S, TruePlaces
 from sim_bridge.sitl.bridge import BridgeProgress
 from sim_bridge.sitl.world import SitlWorld
 
@@ -40,7 +40,7 @@ class LineWriter:
             return
         self._next_s = now_s + PERIOD_S
         positions = tuple((float(n), float(e), float(d)) for n, e, d in positions_m)
-        _write(msgspec.json.encode(TruthSample(now_s + world.unix_offset_s, positions)))
+        _write(msgspec.json.encode(TruePlaces(now_s + world.unix_offset_s, positions)))
 
 
 def read_progress(line: bytes) -> ProgressLine | None:

@@ -12,7 +12,7 @@ from rich.console import Console
 from agent.config.tables import FleetConfig
 from fleetloc.errors import BAD_INPUT, REFUSED
 from fleetloc.run import live_table, run_files
-from fleetloc.run.fleet_run import WATCH_S, Death, FleetRun, Outcome, RunFailed
+from fleetloc.run.fleet_run import WATCH_S, Death, FleetRun, RunFailed, RunOutcome
 from fleetloc.run.processes import Child, stop_all
 from fleetloc.run.sitl_lines import ProgressLine, read_progress
 from sim_bridge.sitl.mission import load_mission
@@ -48,11 +48,11 @@ class SitlRun(FleetRun):
         """A simulator went silent, which ended the run."""
 
     @property
-    def outcome(self) -> Outcome:
+    def outcome(self) -> RunOutcome:
         """What the files in the run's folder do not tell."""
         return self._outcome
 
-    async def fly(self) -> Outcome:
+    async def fly(self) -> RunOutcome:
         """Start the bridge, wait for the simulators, start the daemons, fly, stop everything.
 
         Raises `RunFailed` for a simulator that does not come and for a process that cannot begin; no child outlives

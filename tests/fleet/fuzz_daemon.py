@@ -29,7 +29,7 @@ from agent.config.endpoints import parse_endpoint
 from agent.config.reading import load_config, with_other_table
 from agent.config.tables import FleetConfig
 from fleetloc.output import print_table, write_json
-from fleetloc.report.fleet_results import Results, load_results
+from fleetloc.report.fleet_results import FleetResults, load_results
 from fleetloc.run import run_files
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from fleetloc.run.processes import resident_mb
@@ -237,7 +237,7 @@ def grown(attack: Attack) -> Counter[str]:
     return delta
 
 
-def position_errors_m(results: Results, agent_id: int, begin_s: float, end_s: float) -> NDArray[np.float64]:
+def position_errors_m(results: FleetResults, agent_id: int, begin_s: float, end_s: float) -> NDArray[np.float64]:
     """Distances of an agent's own position from the truth between two times since the start of the world."""
     track = next(track for track in results.tracks if track.agent_id == agent_id)
     inside = (track.time_s >= begin_s) & (track.time_s < end_s) & track.known
@@ -299,7 +299,7 @@ def late_packets(fleet: FleetProcess, agent_id: int) -> int:
     return sum(int(counters.get(f"{kind}: late", 0)) for kind in ("measurements", "information"))
 
 
-def quiet_results(config: FleetConfig, folder: Path, duration_s: float) -> Results:
+def quiet_results(config: FleetConfig, folder: Path, duration_s: float) -> FleetResults:
     """The same world without an attack, in virtual time."""
     sim = msgspec.structs.replace(sim_table(config), duration_s=float(np.ceil(duration_s)) + 1.0)
     quiet = with_other_table(config, "sim", sim)

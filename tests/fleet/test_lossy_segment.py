@@ -16,7 +16,7 @@ import pytest
 
 from agent.config.reading import load_config
 from fleetloc.report.fleet_report import report_figures
-from fleetloc.report.fleet_results import Results, load_results
+from fleetloc.report.fleet_results import FleetResults, load_results
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from tests.support.lossnet.delivery import Delivery, delivery
 from tests.support.lossnet.flight import LossyFlight, why_not
@@ -45,7 +45,7 @@ class Flown:
     fleet: dict[str, Any]
     found: Delivery
     repeated: int
-    results: Results
+    results: FleetResults
     witness: Witness
 
     def net_age_s(self, percent: float) -> float:

@@ -17,7 +17,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from fleetloc.report.fleet_results import Results
+from fleetloc.report.fleet_results import FleetResults
 
 ROOT = Path(__file__).parents[2]
 WAKE_PERIOD_S = 0.005
@@ -58,7 +58,7 @@ def witnessed(folder: Path) -> Iterator[Path]:
         process.wait()
 
 
-def check_on_time(results: Results, witness: Witness, least: float = 0.95) -> None:
+def check_on_time(results: FleetResults, witness: Witness, least: float = 0.95) -> None:
     """Nearly all estimates are out in time, of those ticks for whose answer the machine was in time itself."""
     for track in results.tracks:
         tick_end_s = results.start_unix_s + track.time_s + results.period_s

@@ -14,8 +14,8 @@ from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
 from estimators.model.layout import position
 from fleetloc.run import live_table
-from fleetloc.run.fleet_observer import FleetObserver
-from fleetloc.run.live_truth import LiveTruth, TruthSample, TruthWriter
+from fleetloc.run.fleet_observer import RunObserver
+from fleetloc.run.live_truth import LiveTruth, TruePlaces, TruthWriter
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.simulation import Simulation
 from transport.messages.estimate_body import FleetEstimate
@@ -37,7 +37,7 @@ def truth_moving_north(config: FleetConfig) -> LiveTruth:
     start_s = config.fleet.epoch_unix_s + TICK * config.fleet.period_s
     for step in range(-5, 6):
         place = (10.0 * 0.1 * step, 0.0, -5.0)
-        assert truth.on_line(msgspec.json.encode(TruthSample(start_s + 0.1 * step, (place,) * 3)))
+        assert truth.on_line(msgspec.json.encode(TruePlaces(start_s + 0.1 * step, (place,) * 3)))
     return truth
 
 
@@ -55,13 +55,13 @@ def diagnostics(ticks: int = 10, state: str = "ok", reasons: tuple[str, ...] = (
     return Diagnostics(2, state, reasons, counters, gauges, neighbours)
 
 
-def row_of(config: FleetConfig, observer: FleetObserver, truth: LiveTruth, **ended: str) -> live_table.Row:
+def row_of(config: FleetConfig, observer: RunObserver, truth: LiveTruth, **ended: str) -> live_table.Row:
     dead = {int(name.removeprefix("agent_")): why for name, why in ended.items()}
     return live_table.rows(config, observer, truth, dead, NOW_S)[1]
 
 
 def test_a_drone_that_is_well(config: FleetConfig) -> None:
-    observer = FleetObserver(config, Path(), lambda: None)
+    observer = RunObserver(config, Path(), lambda: None)
     observed = observer.agents[2]
     observed.estimate, observed.estimate_s = estimate(0.25), NOW_S - 0.05
     observed.on_diagnostics(diagnostics())
@@ -71,7 +71,7 @@ def test_a_drone_that_is_well(config: FleetConfig) -> None:
 
 
 def test_silence_death_and_start_are_told_apart(config: FleetConfig) -> None:
-    observer, truth = FleetObserver(config, Path(), lambda: None), truth_moving_north(config)
+    observer, truth = RunObserver(config, Path(), lambda: None), truth_moving_north(config)
     assert row_of(config, observer, truth).status == "starting"
     observed = observer.agents[2]
     observed.estimate, observed.estimate_s = estimate(0.0), NOW_S - 5.0
@@ -86,14 +86,14 @@ def test_silence_death_and_start_are_told_apart(config: FleetConfig) -> None:
 
 
 def test_an_estimate_that_knows_nothing_has_no_error(config: FleetConfig) -> None:
-    observer = FleetObserver(config, Path(), lambda: None)
+    observer = RunObserver(config, Path(), lambda: None)
     observer.agents[2].estimate, observer.agents[2].estimate_s = estimate(0.0, sigma_m=1e4), NOW_S
     row = row_of(config, observer, truth_moving_north(config))
     assert (row.error, row.sigma) == ("", "unknown")
 
 
 def test_counters_that_go_back_begin_another_life(config: FleetConfig) -> None:
-    observed = FleetObserver(config, Path(), lambda: None).agents[2]
+    observed = RunObserver(config, Path(), lambda: None).agents[2]
     for ticks in (10, 20, 3, 12):
         observed.on_diagnostics(diagnostics(ticks))
     assert [life.counters["ticks"] for life in observed.ended_lives] == [20]
@@ -102,7 +102,7 @@ def test_counters_that_go_back_begin_another_life(config: FleetConfig) -> None:
 
 
 def test_table_and_lines_hold_the_same(config: FleetConfig) -> None:
-    observer = FleetObserver(config, Path(), lambda: None)
+    observer = RunObserver(config, Path(), lambda: None)
     observer.agents[2].estimate, observer.agents[2].estimate_s = estimate(0.25), NOW_S
     observer.agents[2].on_diagnostics(diagnostics())
     picture = live_table.rows(config, observer, truth_moving_north(config), {}, NOW_S)

@@ -153,12 +153,12 @@ async def test_the_monitor_declares_subscribers_and_nothing_else(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     from agent.config.reading import load_config
-    from fleetloc.monitor.listener import Listener
+    from fleetloc.monitor.listener import FleetListener
 
     recorder = Recorder()
     monkeypatch.setattr("zenoh.open", lambda _: recorder)
     config = load_config(fleet_file(tmp_path, 'mode = "unsigned"'))
-    listener = Listener(config, tmp_path, lambda _: None, lambda *_: None)
+    listener = FleetListener(config, tmp_path, lambda _: None, lambda *_: None)
     await listener.open()
     declared = [name for name, _ in recorder.calls if name not in ("liveliness", "undeclare", "close")]
     assert declared == ["declare_subscriber"] * 7  # est and diag of three drones, and who is there

@@ -18,7 +18,7 @@ from fleetloc import cli
 from fleetloc.report.fleet_report import report_figures, write_report
 from fleetloc.report.fleet_results import load_results, unbroken
 from fleetloc.run import run_files
-from fleetloc.run.fleet_run import Death, Outcome, Use
+from fleetloc.run.fleet_run import Death, RunOutcome, Use
 from sim_bridge.world.truth import Truth
 from transport.messages.report_body import Diagnostics
 
@@ -69,12 +69,12 @@ def make_run(directory: Path) -> Any:
     return config
 
 
-def outcome() -> Outcome:
+def outcome() -> RunOutcome:
     life = {"packets sent": 100, "packets received": 50, "measurements: late": 2, "information: late": 3}
     life |= {"rejected stale": 1, "gps: samples": 40, "gps: wrong time": 4, "skipped gps: no fix": 6}
     lives = {1: [Diagnostics(1, "ok", (), life, {"cpu_fraction": 0.5}), Diagnostics(1, "ok", (), life)]}
     use = {1: Use(1.0, 3.0, 20.0, 210.0)}
-    return Outcome(wall_s=21.0, deaths=[Death("agent 1", 10.0, "killed by SIGKILL: <b>")], use=use, lives=lives)
+    return RunOutcome(wall_s=21.0, deaths=[Death("agent 1", 10.0, "killed by SIGKILL: <b>")], use=use, lives=lives)
 
 
 @pytest.fixture

@@ -15,7 +15,7 @@ import numpy as np
 
 from agent.onboard import OnboardAgent
 from agent.watch.health import Health
-from transport.messages.header import MAX_BODY_BYTES, Kind
+from transport.messages.header import MAX_BODY_BYTES, PacketKind
 from transport.messages.report_body import Diagnostics
 
 TICKS_REMEMBERED = 1024
@@ -147,7 +147,7 @@ def diagnostics_of(
 
 def _fitting(neighbours: dict[str, dict[str, float]], taken_bytes: int) -> dict[str, dict[str, float]]:
     """Neighbours for whom a body has room that already holds so many bytes."""
-    left_bytes = MAX_BODY_BYTES[Kind.DIAG] - taken_bytes - len(',"neighbours":{}')
+    left_bytes = MAX_BODY_BYTES[PacketKind.DIAG] - taken_bytes - len(',"neighbours":{}')
     fitting: dict[str, dict[str, float]] = {}
     for agent_id, gauges in neighbours.items():
         left_bytes -= len(msgspec.json.encode({agent_id: gauges})) - len("{}") + len(",")

@@ -16,7 +16,7 @@ from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.settings import EstimatorSettings
 from tests.support.onboard import CONNECTED, onboard_of
-from transport.messages.header import Kind
+from transport.messages.header import PacketKind
 from transport.messages.measurement_body import Measurements
 from transport.security.opening import Received
 
@@ -73,7 +73,7 @@ class Notebook:
 
 
 def received(sender: int, message: Any, now_s: float = 0.0) -> Received:
-    kind = Kind.MEAS if isinstance(message, Measurements) else Kind.INFO
+    kind = PacketKind.MEAS if isinstance(message, Measurements) else PacketKind.INFO
     return Received(sender, kind, 1, 0, now_s, message)
 
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from transport.errors import Reason, RejectionCounter
 from transport.messages.clock_body import ClockAnswer
-from transport.messages.header import Header, Kind
+from transport.messages.header import Header, PacketKind
 
 CLOCK_SAMPLES = 30
 CLOCK_BEST_SHARE = 0.2
@@ -72,7 +72,7 @@ class Peer:
         self.clock = ClockFilter()
         self.last_received_s: float | None = None
         self._boot: int | None = None
-        self._numbers: dict[Kind, _Numbers] = {}
+        self._numbers: dict[PacketKind, _Numbers] = {}
         self._lost_before = 0
 
     @property
@@ -93,7 +93,7 @@ class Peer:
             self._numbers.clear()
         self.received += 1
         self.last_received_s = now
-        if header.kind is Kind.CLOCK:
+        if header.kind is PacketKind.CLOCK:
             return  # answers go to whoever asked: the numbers between are other neighbours', not lost
         numbers = self._numbers.setdefault(header.kind, _Numbers(header.seq, header.seq, 0))
         numbers.received += 1

@@ -30,7 +30,7 @@ FLAG_FLOAT64 = 0b1
 KNOWN_FLAGS = FLAG_FLOAT64
 
 
-class Kind(IntEnum):
+class PacketKind(IntEnum):
     """What the body is; one kind for each stream that carries packets. 4 is not used."""
 
     MEAS = 1
@@ -40,14 +40,14 @@ class Kind(IntEnum):
     DIAG = 6
 
 
-STREAM_OF_KIND = {kind: Stream[kind.name] for kind in Kind}
+STREAM_OF_KIND = {kind: Stream[kind.name] for kind in PacketKind}
 
 MAX_BODY_BYTES = {
-    Kind.MEAS: MAX_DATAGRAM_BODY_BYTES,
-    Kind.INFO: MAX_DATAGRAM_BODY_BYTES,
-    Kind.EST: 64 * 1024,
-    Kind.CLOCK: 64,
-    Kind.DIAG: 16 * 1024,
+    PacketKind.MEAS: MAX_DATAGRAM_BODY_BYTES,
+    PacketKind.INFO: MAX_DATAGRAM_BODY_BYTES,
+    PacketKind.EST: 64 * 1024,
+    PacketKind.CLOCK: 64,
+    PacketKind.DIAG: 16 * 1024,
 }
 MAX_PACKET_BYTES = HEADER_BYTES + max(MAX_BODY_BYTES.values()) + SIGNATURE_BYTES
 
@@ -81,7 +81,7 @@ class Header:
         `FLAG_FLOAT64` or 0.
     """
 
-    kind: Kind
+    kind: PacketKind
     sender: int
     boot: int
     seq: int
@@ -128,7 +128,7 @@ def unpack_header(packet: bytes, *, fleet: int, signed: bool) -> Header:
     if version != VERSION:
         raise Rejected(Reason.BAD_VERSION, f"version {version}, expected {VERSION}")
     try:
-        kind = Kind(kind_code)
+        kind = PacketKind(kind_code)
     except ValueError:
         raise Rejected(Reason.UNKNOWN_KIND, f"kind {kind_code}") from None
     if fleet_found != fleet:

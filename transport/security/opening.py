@@ -15,7 +15,7 @@ from transport.messages.header import (
     HEADER_BYTES,
     STREAM_OF_KIND,
     Header,
-    Kind,
+    PacketKind,
     fleet_hash,
     unpack_header,
 )
@@ -36,7 +36,7 @@ class Received:
     """
 
     sender: int
-    kind: Kind
+    kind: PacketKind
     seq: int
     sent_ns: int
     received_s: float
@@ -136,16 +136,16 @@ class Opener:
     def _decode(self, header: Header, body: bytes, now: float) -> Message | None:
         h, double = header, bool(header.flags & FLAG_FLOAT64)
         match header.kind:
-            case Kind.MEAS:
+            case PacketKind.MEAS:
                 return decode_measurements(body, tick=h.tick, count=h.n, roster=self._roster)
-            case Kind.INFO:
+            case PacketKind.INFO:
                 part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)
-            case Kind.EST:
+            case PacketKind.EST:
                 return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
-            case Kind.CLOCK:
+            case PacketKind.CLOCK:
                 return decode_clock_answer(body)
-            case Kind.DIAG:
+            case PacketKind.DIAG:
                 report = decode_diagnostics(body)
                 if report.agent_id != h.sender:
                     raise Rejected(Reason.OUT_OF_RANGE, f"{h.kind.name} of agent {report.agent_id}")

@@ -12,11 +12,11 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from transport.errors import Reason, Rejected
-from transport.messages.header import Header, Kind
+from transport.messages.header import Header, PacketKind
 
 WINDOW = 64
 
-StreamOf = tuple[int, Kind]
+StreamOf = tuple[int, PacketKind]
 """(sender, kind)."""
 
 

@@ -13,7 +13,7 @@ from transport.messages.header import (
     MAX_BODY_BYTES,
     STREAM_OF_KIND,
     Header,
-    Kind,
+    PacketKind,
     fleet_hash,
     pack_header,
 )
@@ -36,7 +36,7 @@ class Packet:
 
 @dataclass(frozen=True, slots=True)
 class _Body:
-    kind: Kind
+    kind: PacketKind
     data: bytes
     tick: int = 0
     round: int = 0
@@ -53,11 +53,11 @@ class Sealer:
 
     def __init__(self, fleet: str, agent_id: int, *, boot: int, signing: Signing) -> None:
         self._agent_id = check_agent_id(agent_id)
-        self._keys = {kind: key_expression(fleet, agent_id, STREAM_OF_KIND[kind]) for kind in Kind}
+        self._keys = {kind: key_expression(fleet, agent_id, STREAM_OF_KIND[kind]) for kind in PacketKind}
         self._fleet = fleet_hash(fleet)
         self._boot = boot
         self._signing = signing
-        self._seq = dict.fromkeys(Kind, 0)
+        self._seq = dict.fromkeys(PacketKind, 0)
         self.left_out = 0
         self.sent = 0
 
@@ -74,21 +74,21 @@ class Sealer:
             case Measurements():
                 encoded = encode_measurements(message)
                 self.left_out += encoded.left_out
-                return [_Body(Kind.MEAS, encoded.body, message.tick, n=encoded.count)]
+                return [_Body(PacketKind.MEAS, encoded.body, message.tick, n=encoded.count)]
             case Information():
                 if double is None:
                     double = not float32_suffices(message.information)
                 flags, n = (FLAG_FLOAT64 if double else 0), len(message.agents)
                 parts = encode_information(message, double=double)
-                return [_Body(Kind.INFO, part, message.tick, message.round, n, flags) for part in parts]
+                return [_Body(PacketKind.INFO, part, message.tick, message.round, n, flags) for part in parts]
             case FleetEstimate():
                 data = encode_estimate(message, double=bool(double))
                 flags = FLAG_FLOAT64 if double else 0
-                return [_Body(Kind.EST, data, message.tick, n=len(message.agents), flags=flags)]
+                return [_Body(PacketKind.EST, data, message.tick, n=len(message.agents), flags=flags)]
             case Diagnostics():
-                return [_Body(Kind.DIAG, encode_diagnostics(message))]
+                return [_Body(PacketKind.DIAG, encode_diagnostics(message))]
             case ClockAnswer():
-                return [_Body(Kind.CLOCK, encode_clock_answer(message))]
+                return [_Body(PacketKind.CLOCK, encode_clock_answer(message))]
 
     def _packet(self, body: _Body, t_ns: int) -> Packet:
         kind, size = body.kind, len(body.data)

@@ -11,9 +11,9 @@ from agent.inputs import PacketIn
 from agent.log.flight_reader import FlightReader, RecordedInput
 from fleetloc.run import run_files
 from transport.link.streams import Stream, parse_key
-from transport.messages.header import Header, Kind, fleet_hash, unpack_header
+from transport.messages.header import Header, PacketKind, fleet_hash, unpack_header
 
-KIND_OF = {Stream.MEAS: Kind.MEAS, Stream.INFO: Kind.INFO}
+KIND_OF = {Stream.MEAS: PacketKind.MEAS, Stream.INFO: PacketKind.INFO}
 MCAP = ".mcap"
 
 
@@ -21,7 +21,7 @@ MCAP = ".mcap"
 class Pair:
     """One directed pair: packets heard, their ages at arrival, and when the first came."""
 
-    seen: set[tuple[Kind, int]] = field(default_factory=set)
+    seen: set[tuple[PacketKind, int]] = field(default_factory=set)
     ages_s: list[float] = field(default_factory=list)
     sent_s: list[float] = field(default_factory=list)
 
@@ -80,10 +80,10 @@ def delivery(directory: Path, pairs: list[tuple[int, int]], begin_s: float, end_
     return Delivery(share, ages_s, sent_s, first_s)
 
 
-def _numbers_sent(heard: dict[tuple[int, int], Pair], sender: int) -> set[tuple[Kind, int]]:
+def _numbers_sent(heard: dict[tuple[int, int], Pair], sender: int) -> set[tuple[PacketKind, int]]:
     """All numbers between the first and the last that anybody heard of a sender."""
-    numbers: set[tuple[Kind, int]] = set()
-    for kind in Kind:
+    numbers: set[tuple[PacketKind, int]] = set()
+    for kind in PacketKind:
         seen = [seq for (who, _), pair in heard.items() if who == sender for k, seq in pair.seen if k is kind]
         numbers |= {(kind, seq) for seq in range(min(seen, default=0), max(seen, default=-1) + 1)}
     return numbers

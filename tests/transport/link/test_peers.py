@@ -10,10 +10,10 @@ from hypothesis import strategies as st
 from transport.errors import Reason
 from transport.link.peers import ClockFilter, Peer, PeerTable
 from transport.messages.clock_body import ClockAnswer
-from transport.messages.header import Header, Kind
+from transport.messages.header import Header, PacketKind
 
 
-def header(seq: int, *, kind: Kind = Kind.MEAS, boot: int = 1, sender: int = 2) -> Header:
+def header(seq: int, *, kind: PacketKind = PacketKind.MEAS, boot: int = 1, sender: int = 2) -> Header:
     return Header(kind, sender, boot, seq, 0, 0, 0, 0, 0, 0)
 
 
@@ -38,7 +38,7 @@ def test_kinds_are_numbered_each_for_itself() -> None:
     peer = Peer()
     for seq in (1, 2, 3):
         peer.accepted(header(seq), 0.0)
-        peer.accepted(header(10 * seq, kind=Kind.INFO), 0.0)
+        peer.accepted(header(10 * seq, kind=PacketKind.INFO), 0.0)
     assert peer.lost == 18
 
 

@@ -13,7 +13,7 @@ from transport.errors import Rejected
 from transport.link.streams import key_expression
 from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
-from transport.messages.header import HEADER, HEADER_BYTES, STREAM_OF_KIND, Kind
+from transport.messages.header import HEADER, HEADER_BYTES, STREAM_OF_KIND, PacketKind
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import (
     AccelerationRecord,
@@ -193,5 +193,5 @@ def test_uwb_frames_are_sound_or_refused() -> None:
 
 
 def test_every_kind_of_packet_was_fuzzed() -> None:
-    kinds = {Kind(packet[3]) for _, packet in samples(UNSIGNED)}
-    assert kinds == set(Kind)
+    kinds = {PacketKind(packet[3]) for _, packet in samples(UNSIGNED)}
+    assert kinds == set(PacketKind)

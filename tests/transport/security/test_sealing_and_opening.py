@@ -14,7 +14,7 @@ from transport.errors import EncodeError, Reason, Rejected, SettingsError
 from transport.link.streams import Stream, key_expression
 from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
-from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, Kind
+from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, PacketKind
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurements, PositionRecord, RangeRecord, SpeedRecord
 from transport.messages.report_body import Diagnostics
@@ -239,7 +239,7 @@ def test_a_packet_cannot_be_replayed_as_another_stream() -> None:
     # GIVEN bytes that would be read as a clock's answer; THEN the signature binds them to the stream they came on
     receiver = Receiver()
     diagnostics = sealed(Diagnostics(2, "ok"))
-    assert receiver.open(header_with("kind", bytes([Kind.CLOCK]))(diagnostics), stream=Stream.CLOCK) is None
+    assert receiver.open(header_with("kind", bytes([PacketKind.CLOCK]))(diagnostics), stream=Stream.CLOCK) is None
     assert receiver.refused == [Reason.BAD_SIGNATURE]
 
 

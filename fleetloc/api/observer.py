@@ -50,7 +50,9 @@ class FleetObserver:
         Messages that are not taken wait, at most ``most_waiting`` of them; then the oldest go.
         """
         config = load_whole(config_file)
-        self._listener = FleetListener(config, Path(config_file).parent, self._on_message, self._on_presence, endpoints)
+        self._listener = FleetListener(
+            config, Path(config_file).parent, self._on_message, self._on_presence, endpoints
+        )
         self._waiting: deque[Heard] = deque(maxlen=most_waiting)
         self._news = asyncio.Event()
         self._present: set[int] = set()

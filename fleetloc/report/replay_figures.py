@@ -40,7 +40,10 @@ def load_results(prepared: Prepared, directory: Path) -> ReplayResults:
     agents = [vehicle.agent_id for vehicle in prepared.inputs.plan.vehicles]
     references = {
         agent_id: ComparedTracks(
-            *(WrittenTrack(track_path(directory, kind, agent_id)) for kind in ("truth", "autopilot", "gps", "gps_received"))
+            *(
+                WrittenTrack(track_path(directory, kind, agent_id))
+                for kind in ("truth", "autopilot", "gps", "gps_received")
+            )
         )
         for agent_id in agents
     }

@@ -29,7 +29,9 @@ Builder = Callable[[float], Message | None]
 class StreamMessages:
     """Builds the messages; ``None`` where the autopilot has nothing to say yet."""
 
-    def __init__(self, state: AutopilotState, vehicle: AutopilotVehicle, unix_offset_s: float, system_id: int) -> None:
+    def __init__(
+        self, state: AutopilotState, vehicle: AutopilotVehicle, unix_offset_s: float, system_id: int
+    ) -> None:
         """``unix_offset_s``: Unix time minus the clock of ``now``."""
         self._state, self._vehicle, self._unix_offset_s = state, vehicle, unix_offset_s
         self._system_id = system_id

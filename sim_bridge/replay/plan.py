@@ -61,7 +61,9 @@ class ReplayPlan:
         return max(vehicle.last_s for vehicle in self.vehicles)
 
 
-def make_plan(config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: dict[int, float] | None = None) -> ReplayPlan:
+def make_plan(
+    config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: dict[int, float] | None = None
+) -> ReplayPlan:
     """Assign and align; raises `ReplayError`, or `LogError` from a log that cannot be read.
 
     ``unix_zero_s`` gives the Unix time of log time 0 by the index of the source, where it is known better than the

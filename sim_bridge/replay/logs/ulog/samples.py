@@ -103,7 +103,9 @@ def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed
             yield arrival_s, AttitudeSample(t_s, quaternion)
 
 
-def gps_samples(table: TopicTable, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
+def gps_samples(
+    table: TopicTable, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]
+) -> Iterator[Timed]:
     """``vehicle_gps_position`` or ``sensor_gps``; ``eph``, ``epv`` are 1-sigma in m."""
     where = degrees(table)
     if where is None or "fix_type" not in table.columns:

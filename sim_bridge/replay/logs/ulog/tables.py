@@ -134,7 +134,9 @@ def _parsed(ulog: Any, path: Path, file: Unpacked, names: list[str]) -> Any:
         raise LogError(path, "a readable .ulg", str(error)) from None
 
 
-def _table(name: str, data: Mapping[str, Column], fields: tuple[str, ...], skipped: Counter[str]) -> TopicTable | None:
+def _table(
+    name: str, data: Mapping[str, Column], fields: tuple[str, ...], skipped: Counter[str]
+) -> TopicTable | None:
     stamps = data.get("timestamp")
     if stamps is None or stamps.dtype != np.uint64:
         skipped[f"{name}: its description is damaged"] += 1

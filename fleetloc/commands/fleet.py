@@ -14,7 +14,7 @@ from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles, with
 if TYPE_CHECKING:
     from agent.config.documents import Override
     from agent.config.tables import FleetConfig
-    from fleetloc.run.fleet_run import Outcome
+    from fleetloc.run.fleet_run import RunOutcome
 
 
 DEMO_FOLDER = "fleetloc-demo"
@@ -119,13 +119,13 @@ def _prepared(
     return fleet
 
 
-def _fly(config: FleetConfig, folder: Path) -> Outcome:
+def _fly(config: FleetConfig, folder: Path) -> RunOutcome:
     import asyncio
 
     from fleetloc.run.fleet_run import FleetRun
     from fleetloc.verbosity import stderr_console
 
-    async def fly() -> Outcome:
+    async def fly() -> RunOutcome:
         return await FleetRun(config, folder, stderr_console()).fly()
 
     return asyncio.run(fly())

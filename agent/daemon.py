@@ -92,7 +92,7 @@ def run(
     """
     try:
         if agent_id not in config.ids:
-            raise ConfigError("agent", "id", f"one of {', '.join(map(str, config.ids))}", str(agent_id))
+            raise ConfigError("--id", "", f"one of {', '.join(map(str, config.ids))}", str(agent_id))
         daemon = Daemon(config, agent_id, make_estimator, base, observers)
         warm_up(config, agent_id, make_estimator)
         asyncio.run(daemon.run())

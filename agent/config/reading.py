@@ -10,7 +10,7 @@ import json
 import tomllib
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, replace
-from pathlib import Path as FilePath
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 import msgspec
@@ -30,7 +30,7 @@ T = TypeVar("T", bound=msgspec.Struct)
 
 
 def load_config(
-    path: str | FilePath, overrides: Iterable[Override] = (), profiles: Iterable[str | FilePath] = ()
+    path: str | Path, overrides: Iterable[Override] = (), profiles: Iterable[str | Path] = ()
 ) -> FleetConfig:
     """Read a fleet's configuration.
 
@@ -45,7 +45,7 @@ def load_config(
 
 
 def load_document(
-    path: str | FilePath, overrides: Iterable[Override] = (), profiles: Iterable[str | FilePath] = ()
+    path: str | Path, overrides: Iterable[Override] = (), profiles: Iterable[str | Path] = ()
 ) -> Document:
     """The same, not understood yet; raises `ConfigError` for a file that cannot be read and for no override."""
     document = read_document(path)
@@ -95,7 +95,7 @@ def read(document: Document) -> tuple[FleetConfig | None, list[ConfigError]]:
     return config, [document.error(explained(fault)) for fault in faults]
 
 
-def load_estimator_settings(path: str | FilePath | None, overrides: Iterable[Override] = ()) -> EstimatorSettings:
+def load_estimator_settings(path: str | Path | None, overrides: Iterable[Override] = ()) -> EstimatorSettings:
     """Only the ``[estimator]`` table of a configuration (None: the defaults), with its overrides.
 
     The rest of the file is not looked at: a tick-level recording brings its own fleet. Raises `ConfigError`,

@@ -8,8 +8,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from agent.config.endpoints import Endpoint, LinkKind, parse_endpoint
+from agent.config.faults import Fault
 from agent.config.tables import FleetConfig
-from agent.errors import ConfigError
 from agent.mavlink.adsb import AdsbReporter
 from agent.mavlink.signing import LinkSigning
 from agent.radio.security import is_field, key_folder
@@ -53,8 +53,8 @@ def _adsb_signing(config: FleetConfig, agent_id: int, base: Path) -> LinkSigning
     if endpoint.kind is LinkKind.SERIAL:
         promised = False
     if wanted == "off" and promised and not _on_loopback(endpoint):
-        expected = f'mavlink.signing = "auto" or "on" in profile {config.security.profile}'
-        raise ConfigError("adsb", "address", expected, '"off"')
+        expected = f'"auto" or "on" for adsb.address in profile {config.security.profile}'
+        raise config.others.document.error(Fault("mavlink.signing", expected, '"off"'))
     if wanted == "on" or (wanted == "auto" and promised):
         return LinkSigning(load_mavlink_key(key_folder(config, base), agent_id), unix_s=0.0, link_id=ADSB_LINK_ID)
     return None

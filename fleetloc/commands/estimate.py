@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from fleetloc.options import Overrides
+
 if TYPE_CHECKING:
     from sim_bridge.studies.lockstep import LockstepResult
     from sim_bridge.studies.recording import Recording
@@ -22,9 +24,7 @@ def estimate(
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file; only its [estimator] table is read.")
     ] = None,
-    overrides: Annotated[
-        list[str] | None, typer.Option("--set", help="estimator.KEY=VALUE, beats the file; may be repeated.")
-    ] = None,
+    overrides: Overrides = None,
     out: Annotated[
         Path | None, typer.Option("--out", metavar="FILE", help="Write mean, cov_diag and status here (.npz).")
     ] = None,

@@ -126,7 +126,7 @@ def test_nobody_looks_on_unless_asked_for_and_the_manager_hears_ready_last(tmp_p
 def test_a_field_fleet_sends_no_unsigned_traffic_over_the_air(tmp_path: Path) -> None:
     tables = {"security": {"profile": "field"}, "mavlink": {"signing": "off"}}
     observers_of(fleet(**tables, adsb={"address": "udpout:127.0.0.1:14550"}), 1, tmp_path, {})
-    with pytest.raises(ConfigError, match=r"adsb: address: expected mavlink\.signing"):
+    with pytest.raises(ConfigError, match=r"mavlink\.signing: expected .* for adsb\.address"):
         observers_of(fleet(**tables, adsb={"address": "udpout:192.168.7.1:14550"}), 1, tmp_path, {})
 
 

@@ -75,7 +75,7 @@ def test_a_daemon_is_not_refused_for_a_mistake_in_a_table_of_others(
     path.write_text(LINE3.read_text().replace('profile = "paper"', 'profile = "papper"'))
     assert check(capsys, path)[0] == 2
     assert cli.main(["agent", str(path), "--id", "9"]) == 2  # it gets as far as looking for its agent
-    assert "agent: id: expected one of 1, 2, 3, found 9" in capsys.readouterr().err
+    assert "--id: expected one of 1, 2, 3, found 9" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(

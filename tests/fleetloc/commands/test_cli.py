@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import logging
 import re
 import subprocess
 import sys
@@ -190,3 +191,21 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(
     told = capsys.readouterr().err.splitlines()
     assert len(told) == lines
     assert told[-1:] == ["fleetloc: simulated seconds: 25 of 25"][: len(told)]
+
+
+@pytest.mark.parametrize(("options", "told"), [([], []), (["-v"], ["a state changed"]), (["-q"], [])])
+def test_verbose_shows_the_log_of_the_parts(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], options: list[str], told: list[str]
+) -> None:
+    logger = logging.getLogger("fleetloc")
+    monkeypatch.setattr(logger, "handlers", [])  # as at a start, whatever other tests left
+    monkeypatch.setattr(logger, "propagate", True)
+    monkeypatch.setattr(logger, "level", logging.NOTSET)
+
+    def command() -> None:
+        logging.getLogger("fleetloc.part").info("a state changed")
+
+    monkeypatch.setattr(commands_warmup, "register", lambda app: app.command("fail")(command))
+    assert cli.main(["fail", *options]) == 0
+    set_verbosity(0)
+    assert [line.partition(" INFO ")[2] for line in capsys.readouterr().err.splitlines()] == told

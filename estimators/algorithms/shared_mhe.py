@@ -21,7 +21,7 @@ from estimators.algorithms.shared_monitors import Belief, SharedMonitors
 from estimators.consensus.information import NO_PAIRS
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, Status
-from estimators.integrity.witness import Body, body_of
+from estimators.integrity.ambiguity import Body, body_of
 from estimators.model.gaussian import Prior, symmetrised
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector

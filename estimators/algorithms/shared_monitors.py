@@ -1,8 +1,8 @@
 """What watches over the shared estimator: which places the data tell, and whether they allow another one.
 
-Three monitors look at every solved window: what the data alone say (`estimators.integrity.data_information`), the
+Three monitors look at every solved window: what the data alone say (`estimators.integrity.data_observability`), the
 mirror image of the whole fleet (`estimators.integrity.fleet_mirror`), and, for a drone without fixes, a witness of
-its own state (`estimators.integrity.witness`). What they find widens the covariance, takes agents out of the
+its own state (`estimators.integrity.ambiguity`). What they find widens the covariance, takes agents out of the
 observable ones, or moves the belief to the only place that the data allow.
 """
 
@@ -13,9 +13,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.integrity.data_information import DataInformation
+from estimators.integrity.ambiguity import Body, Opinion, Witness, body_of, own_rows
+from estimators.integrity.data_observability import DataInformation
 from estimators.integrity.fleet_mirror import FleetMirror, doubtful, mirror_offset, mirrored
-from estimators.integrity.witness import Body, Opinion, Witness, body_of, own_rows
 from estimators.model.gaussian import covering
 from estimators.model.layout import Layout, block
 from estimators.model.measurements import Matrix, RowTable, Vector

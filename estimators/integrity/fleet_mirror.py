@@ -21,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
-from estimators.integrity.witness import DECISIVE_NATS, FLOOR_M, UNDERSTATED
+from estimators.integrity.ambiguity import DECISIVE_NATS, FLOOR_M, UNDERSTATED
 from estimators.model.gaussian import symmetrised
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimators.integrity.witness import BLIND_TICKS, Body, Opinion, Witness, determined
+from estimators.integrity.ambiguity import BLIND_TICKS, Body, Opinion, Witness, determined
 from estimators.model.measurements import RowTable, empty_rows, position_rows, range_row, velocity_rows
 
 DT = 0.1

@@ -7,7 +7,7 @@ import pytest
 
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from estimators.integrity.data_information import (
+from estimators.integrity.data_observability import (
     OBSERVABLE_SIGMA_M,
     mark_observable,
 )

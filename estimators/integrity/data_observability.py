@@ -13,19 +13,19 @@ from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.compiled.linear_algebra import cholesky_upper, factor_upper, inverse_from_cholesky
+from estimators.integrity.finding import Finding, Gravity, What
+from estimators.integrity.thresholds import OBSERVABLE_SIGMA_M
+from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.corrections import add_row_information
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable
 from estimators.model.members import MemberChange
 from estimators.model.motion import predict_information
 from estimators.model.row_kernels import IntArray
-from estimators.window.types import WindowProblem
 
 START_SIGMA_M = 100.0
 START_SIGMA_MPS = 10.0
 """What stands for knowing nothing."""
-OBSERVABLE_SIGMA_M = 10.0
-"""Position sigma of an agent, along its worst direction, up to which the data say where it is."""
 
 
 def no_information(agents: int) -> Matrix:
@@ -34,39 +34,39 @@ def no_information(agents: int) -> Matrix:
     return np.diag(np.tile(sigmas**-2.0, agents))
 
 
-class DataInformation:
-    """Information that the data gave at the start of an estimator's window."""
+class ObservabilityMonitor:
+    """Keeps the information that the data gave at the start of an estimator's window."""
 
     def __init__(self, agents: int) -> None:
-        self.information = no_information(agents)
+        self._information = no_information(agents)
 
-    def advance(self, problem: WindowProblem, path: Matrix, eps: float, *, slide: bool) -> NDArray[np.bool_]:
-        """Which agents the window's data and those before it observe ``(n,)``.
-
-        ``path`` ``(N+1, 6n)``: where rows are linearised. ``slide``: whether the window's start moves on by a tick.
-        """
-        following = np.empty_like(self.information)
+    def observe(self, evidence: WindowEvidence) -> tuple[Finding, ...]:
+        """A finding about each slot whose position the window's data and those before it do not observe."""
+        following = np.empty_like(self._information)
         observable = np.zeros(len(following) // STATES_PER_AGENT, np.bool_)
         sound = _filter_information(
-            problem.rows,
-            problem.start,
-            problem.accel_variance,
-            np.ascontiguousarray(path),
-            problem.period_s,
-            eps,
-            self.information,
+            evidence.rows,
+            evidence.start,
+            evidence.accel_variance,
+            np.ascontiguousarray(evidence.path),
+            evidence.period_s,
+            evidence.norm_smoothing,
+            self._information,
             following,
             observable,
         )
         if not sound:
-            self.information = no_information(len(observable))
-        elif slide:
-            self.information = following
-        return observable
+            self._information = no_information(len(observable))
+        elif evidence.slide:
+            self._information = following
+        return tuple(
+            Finding(What.NOT_OBSERVABLE, Gravity.ALARM, int(slot), limit=OBSERVABLE_SIGMA_M)
+            for slot in np.flatnonzero(~observable)
+        )
 
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet: of a fresh agent the data say what its prior says."""
-        self.information = change.information(self.information)
+        self._information = change.information(self._information)
 
 
 @entry(

@@ -39,6 +39,12 @@ class What(Enum):
     """The whole fleet may be its own mirror image."""
     NOT_OBSERVABLE = auto()
     """What was measured does not say where the drone is."""
+    UNDERSTATED = auto()
+    """The position may be further off than its covariance says."""
+    ELSEWHERE = auto()
+    """The data hold to another place than the estimate."""
+    REVERSED = auto()
+    """The fleet turned out to be the mirror image of the estimate."""
     CONTRADICTORY = auto()
     """No place explains the measurements."""
     AUTOPILOT = auto()

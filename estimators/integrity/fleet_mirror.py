@@ -14,99 +14,110 @@ wrong side a fleet is turned to fit its fixes, and so is its image.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import NamedTuple
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
-from estimators.integrity.ambiguity import DECISIVE_NATS, FLOOR_M, UNDERSTATED
+from estimators.integrity.finding import Finding, Gravity, What
+from estimators.integrity.thresholds import (
+    CERTAIN_NATS,
+    DECISIVE_NATS,
+    FEWEST_MIRRORED,
+    FLOOR_M,
+    SURE_NATS,
+    UNDERSTATED,
+)
+from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.gaussian import symmetrised
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.row_kernels import ANCHOR_RANGE, POSITION, PRECISION, VALUE, IntArray, encode_rows, predict_row
 
-FEWEST_AGENTS = 4
-"""Fewer are in one plane, and are their own mirror image."""
-CERTAIN_NATS = 24.0
-"""Evidence for the estimate that settles the matter until the fleet comes near a plane again."""
 CREDIT = 0.25
 """Share of an estimate's information that is believed where a fleet is nearly plane: ranges in a plane tell of what
 is across it in the second order only, and a linearisation takes that for more."""
-SURE_NATS = 9.0
-"""Evidence from which on the mirror image, with a probability of 1e-4, is left out of the covariance."""
 TURN_RAD = 0.3
 """1-sigma about each axis by which a fleet that was taken for its mirror image is turned, to fit the fixes better."""
 
 
-class Image(NamedTuple):
-    """How wrong an estimate may be if the fleet is its mirror image."""
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class MirrorImage(Finding):
+    """The fleet may be its own mirror image; ``value`` is the probability of that."""
 
-    probability: float
     offset: Vector
     """Image less estimate ``(6n,)``."""
+
+    @property
+    def probability(self) -> float:
+        """Of the image, 0..1."""
+        assert self.value is not None
+        return self.value
 
     def covered(self, covariance: Matrix) -> Matrix:
         """The mean square error ``(6n, 6n)`` of the estimate, over both."""
         return covariance + self.probability * np.outer(self.offset, self.offset)
 
-    def expected_square(self) -> Vector:
-        """What it adds to the expected square error of each agent's position ``(n,)``, m2."""
-        return np.asarray(self.probability * (self.offset.reshape(-1, 2, 3)[:, 0] ** 2).sum(-1), np.float64)
+    def doubtful(self, covariance: Matrix) -> NDArray[np.bool_]:
+        """Of which agents ``(n,)`` the place is not to be trusted to the estimate's own covariance ``(6n, 6n)``."""
+        claimed = covariance.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3].sum(-1)
+        expected = claimed + self.probability * (self.offset.reshape(-1, 2, 3)[:, 0] ** 2).sum(-1)
+        return np.asarray(expected > np.maximum(FLOOR_M**2, UNDERSTATED * claimed))
 
 
-class FleetMirror:
-    """Follows the odds of an estimate against its mirror image."""
+class FleetMirrorMonitor:
+    """Follows the odds of an estimate against its mirror image; begins certain of the estimate."""
 
-    def __init__(self, lead_nats: float = CERTAIN_NATS) -> None:
-        self.lead_nats = lead_nats
+    def __init__(self) -> None:
+        self._lead_nats = CERTAIN_NATS
         """Log odds; negative: the mirror image is the likelier."""
 
-    def weigh(self, rows: RowTable, state: Vector, eps: float) -> None:
+    def observe(self, evidence: WindowEvidence) -> tuple[Finding, ...]:
+        """A `MirrorImage` while there is doubt; `What.REVERSED` where the fleet has turned out to be the image.
+
+        The oldest tick, whose rows are all there by now, is weighed as it leaves the window. After a reversal the
+        estimate is expected to be the image (`mirrored`), with the odds for it that were against it.
+        """
+        path, rows, start, eps = evidence.path, evidence.rows, evidence.start, evidence.norm_smoothing
+        if path.shape[1] < FEWEST_MIRRORED * STATES_PER_AGENT:
+            return ()
+        if evidence.slide:
+            self._weigh(rows[: start[1]], path[0], eps)
+        self._pass_by(evidence.arrival_mean, evidence.arrival_information)
+        if self._lead_nats < -DECISIVE_NATS:
+            self._lead_nats = -self._lead_nats
+            return (Finding(What.REVERSED, Gravity.NOTED, value=self._lead_nats, limit=DECISIVE_NATS),)
+        weighed = 1 if evidence.slide else 0
+        return self._doubt(rows, start[weighed:], path[weighed:], eps)
+
+    def _weigh(self, rows: RowTable, state: Vector, eps: float) -> None:
         """Use rows ``(m,)`` of one tick, at the estimate ``(6n,)`` of that tick; each row once.
 
         What was certain stays so until the fleet comes near a plane: it cannot have changed sides. The errors of
         fixes last, and a minute of them must not add up to another opinion.
         """
-        if len(state) >= FEWEST_AGENTS * STATES_PER_AGENT and len(rows) and self.lead_nats < CERTAIN_NATS:
+        if len(rows) and self._lead_nats < CERTAIN_NATS:
             gained = likelihood_ratio(rows, state, state + mirror_offset(state), eps)
-            self.lead_nats = min(self.lead_nats + gained, CERTAIN_NATS)
+            self._lead_nats = min(self._lead_nats + gained, CERTAIN_NATS)
 
-    def pass_by(self, state: Vector, information: Matrix) -> None:
+    def _pass_by(self, state: Vector, information: Matrix) -> None:
         """Know no more than an estimate ``(6n,)`` with its information ``(6n, 6n)`` tells of the two."""
-        if len(state) >= FEWEST_AGENTS * STATES_PER_AGENT:
-            offset = mirror_offset(state)
-            self.lead_nats = min(self.lead_nats, 0.5 * CREDIT * float(offset @ information @ offset))
+        offset = mirror_offset(state)
+        self._lead_nats = min(self._lead_nats, 0.5 * CREDIT * float(offset @ information @ offset))
 
-    @property
-    def reversed(self) -> bool:
-        """Whether the fleet has turned out to be the mirror image."""
-        return self.lead_nats < -DECISIVE_NATS
-
-    def image(
-        self, state: Vector, rows: RowTable, start: IntArray, path: Sequence[Vector], eps: float
-    ) -> Image | None:
-        """The mirror image of an estimate ``(6n,)``, unless it can be neglected.
-
-        ``path`` are the states ``(6n,)`` at the ticks that were not weighed yet, the rows of tick k from ``start[k]``
-        on.
-        """
-        if len(state) < FEWEST_AGENTS * STATES_PER_AGENT or self.lead_nats >= SURE_NATS:
-            return None
-        lead_nats = self.lead_nats
+    def _doubt(self, rows: RowTable, start: IntArray, path: Matrix, eps: float) -> tuple[MirrorImage, ...]:
+        """The mirror image of the newest state, unless it can be neglected; ``path`` are those not weighed yet."""
+        lead_nats = self._lead_nats
+        if lead_nats >= SURE_NATS:
+            return ()
         for k, there in enumerate(path):
             lead_nats += likelihood_ratio(rows[start[k] : start[k + 1]], there, there + mirror_offset(there), eps)
         if lead_nats >= SURE_NATS:
-            return None
-        return Image(float(1.0 / (1.0 + np.exp(max(lead_nats, -CERTAIN_NATS)))), mirror_offset(state))
-
-
-def doubtful(image: Image, covariance: Matrix) -> NDArray[np.bool_]:
-    """Of which agents ``(n,)`` the place is not to be trusted to the estimate's own covariance ``(6n, 6n)``."""
-    claimed = covariance.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3].sum(-1)
-    expected = claimed + image.expected_square()
-    return np.asarray(expected > np.maximum(FLOOR_M**2, UNDERSTATED * claimed))
+            return ()
+        probability = float(1.0 / (1.0 + np.exp(max(lead_nats, -CERTAIN_NATS))))
+        image = MirrorImage(What.MIRRORED, Gravity.ALARM, value=probability, offset=mirror_offset(path[-1]))
+        return (image,)
 
 
 def mirror_offset(state: Vector) -> Vector:

@@ -7,10 +7,8 @@ import pytest
 
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from estimators.integrity.data_observability import (
-    OBSERVABLE_SIGMA_M,
-    mark_observable,
-)
+from estimators.integrity.data_observability import mark_observable
+from estimators.integrity.thresholds import OBSERVABLE_SIGMA_M
 from estimators.model.layout import Layout
 from estimators.model.measurements import RowTable, empty_inputs, empty_rows, input_rows, position_rows, range_row
 from estimators.settings import EstimatorSettings

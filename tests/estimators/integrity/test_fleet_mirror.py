@@ -7,16 +7,17 @@ import pytest
 
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
+from estimators.integrity.finding import Finding, Gravity, What, has
 from estimators.integrity.fleet_mirror import (
-    CERTAIN_NATS,
     CREDIT,
-    DECISIVE_NATS,
-    FleetMirror,
-    Image,
+    FleetMirrorMonitor,
+    MirrorImage,
     likelihood_ratio,
     mirror_offset,
     mirrored,
 )
+from estimators.integrity.thresholds import CERTAIN_NATS, DECISIVE_NATS
+from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.layout import Layout
 from estimators.model.measurements import RowTable, empty_inputs, empty_rows, position_rows, range_row
 from estimators.settings import EstimatorSettings
@@ -41,9 +42,53 @@ def shape_error_m(state: np.ndarray, places: np.ndarray) -> float:
     return float(np.sqrt(np.mean(np.sum((state.reshape(-1, 6)[:, :3] - places) ** 2, axis=-1))))
 
 
-def image_of(mirror: FleetMirror, state: np.ndarray) -> Image | None:
-    """With nothing that was not weighed."""
-    return mirror.image(state, empty_rows(), np.zeros(1, np.int64), [], 1e-3)
+def evidence(
+    state: np.ndarray,
+    rows: RowTable,
+    start: list[int],
+    information: np.ndarray | None = None,
+    *,
+    slide: bool = True,
+) -> WindowEvidence:
+    """A window of one tick over an estimate that stands still.
+
+    ``information`` of the arrival cost; without, the estimate is far from a passage.
+    """
+    n = len(state) // 6
+    return WindowEvidence(
+        rows=rows,
+        start=np.array(start),
+        accel_variance=np.ones((1, 3 * n)),
+        path=np.array([state, state]),
+        arrival_mean=state,
+        arrival_information=1e6 * np.eye(6 * n) if information is None else information,
+        slide=slide,
+        period_s=DT,
+        norm_smoothing=1e-3,
+    )
+
+
+def look(
+    monitor: FleetMirrorMonitor, state: np.ndarray, rows: RowTable, information: np.ndarray | None = None
+) -> tuple[Finding, ...]:
+    """What is found as ``rows`` leave the window."""
+    return monitor.observe(evidence(state, rows, [0, len(rows), len(rows)], information))
+
+
+def passage(state: np.ndarray) -> np.ndarray:
+    """The information of an estimate that leaves two nats for it against its image: odds of 7."""
+    offset = mirror_offset(state)
+    return np.asarray(np.eye(len(state)) * 4.0 / (CREDIT * offset @ offset))
+
+
+def image_in(found: tuple[Finding, ...]) -> MirrorImage:
+    (image,) = [finding for finding in found if isinstance(finding, MirrorImage)]
+    return image
+
+
+def fixes_at(state: np.ndarray, variance: float) -> RowTable:
+    places = state.reshape(-1, 6)[:, :3]
+    return np.concatenate([position_rows(1, k, place, np.full(3, variance)) for k, place in enumerate(places)])
 
 
 def test_the_image_has_the_same_ranges_centre_and_motion_and_is_its_own_inverse() -> None:
@@ -81,42 +126,74 @@ def test_the_ratio_is_that_of_gaussian_densities_of_the_fixes_and_ranges_say_not
 
 
 def test_the_odds_are_what_the_closest_passage_left_and_what_fixes_add() -> None:
-    mirror, state = FleetMirror(), at_rest(PLACES)
-    rows = np.concatenate([position_rows(1, k, place, np.full(3, 100.0)) for k, place in enumerate(PLACES)])
-    assert image_of(mirror, state) is None
-    # GIVEN a passage with sigmas as large as the fleet is thick
+    monitor, state = FleetMirrorMonitor(), at_rest(PLACES)
     offset = mirror_offset(state)
-    information = np.eye(30) * 4.0 / (CREDIT * offset @ offset)
-    mirror.pass_by(state, information)
-    assert mirror.lead_nats == pytest.approx(2.0)
+    right, wrong = fixes_at(state, 100.0), fixes_at(state + offset, 100.0)
+    assert look(monitor, state, empty_rows()) == ()
+    # GIVEN a passage with sigmas as large as the fleet is thick
+    image = image_in(look(monitor, state, empty_rows(), passage(state)))
     # THEN the covariance holds the image by its probability
-    image = image_of(mirror, state)
-    assert image is not None
+    assert (image.what, image.gravity) == (What.MIRRORED, Gravity.ALARM)
     assert image.probability == pytest.approx(1.0 / (1.0 + np.exp(2.0)))
-    covered = image.covered(np.zeros((30, 30)))
-    np.testing.assert_allclose(covered, image.probability * np.outer(offset, offset))
-    # and fixes at the estimate take the doubt away, up to a bound
-    mirror.weigh(rows, state, 1e-3)
-    assert mirror.lead_nats == pytest.approx(2.0 + 0.5 * float(offset @ offset) / 100.0)
-    for _ in range(1000):
-        mirror.weigh(rows, state, 1e-3)
-    assert mirror.lead_nats == CERTAIN_NATS
-    # where the matter is closed, whatever the errors of fixes add up to
-    for _ in range(1000):
-        mirror.weigh(rows, state + offset, 1e-3)
-    assert mirror.lead_nats == CERTAIN_NATS
+    np.testing.assert_allclose(image.covered(np.zeros((30, 30))), image.probability * np.outer(offset, offset))
+    # and fixes at the estimate take the doubt away by their likelihood
+    gained = 0.5 * float(offset @ offset) / 100.0
+    assert image_in(look(monitor, state, right)).probability == pytest.approx(1.0 / (1.0 + np.exp(2.0 + gained)))
+    for _ in range(round(2 * CERTAIN_NATS / gained)):
+        found = look(monitor, state, right)
+    assert found == ()
+    # whereupon the matter is closed, whatever the errors of fixes add up to
+    assert all(look(monitor, state, wrong) == () for _ in range(1000))
     # until the next passage, after which fixes at the image say that it is the one
-    mirror.pass_by(state, information)
-    while not mirror.reversed:
-        mirror.weigh(rows, state + offset, 1e-3)
-    assert -2.0 * DECISIVE_NATS < mirror.lead_nats < -DECISIVE_NATS
+    look(monitor, state, empty_rows(), passage(state))
+    needed = 1
+    while not has(found := look(monitor, state, wrong), What.REVERSED):
+        needed += 1
+    assert needed == pytest.approx((2.0 + DECISIVE_NATS) / gained, abs=1.0)
+    # and then the image, which is the estimate from now on, is as sure as the estimate was wrong
+    (reversal,) = found
+    assert reversal.value is not None
+    assert DECISIVE_NATS < reversal.value < 2.0 * DECISIVE_NATS
+    assert look(monitor, state + offset, wrong) == ()
+
+
+def test_what_has_not_left_the_window_counts_too_but_is_not_kept() -> None:
+    monitor, state = FleetMirrorMonitor(), at_rest(PLACES)
+    rows = fixes_at(state, float(mirror_offset(state) @ mirror_offset(state)))  # half a nat
+    m = len(rows)
+    look(monitor, state, empty_rows(), passage(state))
+    for start, slide in (([0, 0, m], True), ([0, m, m], False), ([0, 0, m], True)):
+        image = image_in(monitor.observe(evidence(state, rows, start, slide=slide)))
+        assert image.probability == pytest.approx(1.0 / (1.0 + np.exp(2.5)))
+
+
+def test_a_reversal_turns_the_odds_around() -> None:
+    # GIVEN fixes that speak for the image with 20 nats, after a passage that left two for the estimate
+    monitor, state = FleetMirrorMonitor(), at_rest(PLACES)
+    offset = mirror_offset(state)
+    square = float(offset @ offset)
+    look(monitor, state, empty_rows(), passage(state))
+    (reversal,) = look(monitor, state, fixes_at(state + offset, 0.5 * square / 20.0))
+    assert reversal.what is What.REVERSED
+    assert reversal.value == pytest.approx(18.0)
+    # WHEN later ones speak for what it was THEN that is the image by now, with the odds of both
+    image = image_in(look(monitor, state + offset, fixes_at(state, 0.5 * square / 12.0)))
+    np.testing.assert_allclose(image.offset, -offset, atol=1e-9)
+    assert image.probability == pytest.approx(1.0 / (1.0 + np.exp(18.0 - 12.0)))
+
+
+def test_whose_place_is_doubted_follows_from_how_far_its_image_is() -> None:
+    monitor, state = FleetMirrorMonitor(), at_rest(PLACES)
+    image = image_in(look(monitor, state, empty_rows(), np.zeros((30, 30))))
+    away_m = np.linalg.norm(image.offset.reshape(5, 6)[:, :3], axis=1)
+    assert image.doubtful(1e-4 * np.eye(30)).tolist() == (np.sqrt(image.probability) * away_m > 0.15).tolist()
+    assert not image.doubtful(1e4 * np.eye(30)).any()
 
 
 def test_three_drones_are_their_own_image() -> None:
-    mirror, state = FleetMirror(), at_rest(PLACES[:3])
-    mirror.pass_by(state, np.zeros((18, 18)))
-    mirror.weigh(position_rows(1, 0, PLACES[1], np.ones(3)), state, 1e-3)
-    assert (mirror.lead_nats, image_of(mirror, state)) == (CERTAIN_NATS, None)
+    monitor, state = FleetMirrorMonitor(), at_rest(PLACES[:3])
+    for _ in range(10):
+        assert look(monitor, state, position_rows(1, 0, PLACES[1], np.ones(3)), np.zeros((18, 18))) == ()
 
 
 def test_a_mirrored_estimate_knows_its_ranges_as_well_and_its_direction_less() -> None:
@@ -209,13 +286,11 @@ def test_a_flat_fleet_is_never_sure_of_what_is_above_and_what_below() -> None:
     # GIVEN drones within a decimetre of a plane, whose fixes are good to two metres
     flat = PLACES * np.array([1.0, 1.0, 0.04])
     rng = np.random.default_rng(5)
-    mirror, state = FleetMirror(), at_rest(flat)
-    mirror.pass_by(state, np.kron(np.eye(5), np.diag([100.0, 100.0, 4.0, 1e4, 1e4, 100.0])))
+    monitor, state = FleetMirrorMonitor(), at_rest(flat)
+    look(monitor, state, empty_rows(), np.kron(np.eye(5), np.diag([100.0, 100.0, 4.0, 1e4, 1e4, 100.0])))
     for _ in range(20):
         fixes = [
             position_rows(1, k, place + rng.normal(size=3) * 2.0, np.full(3, 4.0)) for k, place in enumerate(flat)
         ]
-        mirror.weigh(np.concatenate(fixes), state, 1e-3)
-    image = image_of(mirror, state)
-    assert image is not None
-    assert 0.2 < image.probability < 0.8
+        found = look(monitor, state, np.concatenate(fixes))
+    assert 0.2 < image_in(found).probability < 0.8

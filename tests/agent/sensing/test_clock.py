@@ -43,20 +43,19 @@ def test_a_step_of_utc_is_followed_at_once_and_said(size_s: float, forward: bool
 
 def test_an_epoch_that_leaves_now_without_a_tick_is_refused(make_config: MakeConfig) -> None:
     now_s = 1_790_000_000.0
-    assert require_epoch(make_config().fleet, "fleet.toml", unix_s=now_s) is None
+    assert require_epoch(make_config(), unix_s=now_s) is None
     for epoch_s in (0.0, 4_000_000_000.0):
-        fleet = make_config(3, f"fleet.epoch_unix_s={epoch_s}").fleet
-        expected = r"fleet.toml: fleet.epoch_unix_s: expected 1360503270..1790000000, .* found "
+        config = make_config(3, f"fleet.epoch_unix_s={epoch_s}")
+        expected = r"--set: fleet.epoch_unix_s: expected 1360503270..1790000000, .* found "
         with pytest.raises(ConfigError, match=f"{expected}{epoch_s:.0f}$"):
-            require_epoch(fleet, "fleet.toml", unix_s=now_s)
+            require_epoch(config, unix_s=now_s)
 
 
 def test_a_host_that_was_never_told_the_time_is_no_fault_of_the_epoch(make_config: MakeConfig) -> None:
-    fleet = make_config().fleet
-    assert require_epoch(fleet, "fleet.toml", unix_s=1e9) == "clock at 2001-09-09, outside the fleet's time"
+    assert require_epoch(make_config(), unix_s=1e9) == "clock at 2001-09-09, outside the fleet's time"
     # nor where it went on from its last shutdown, a month before the fleet's epoch
-    fleet = make_config(3, "fleet.epoch_unix_s=1790000000").fleet
-    assert require_epoch(fleet, "fleet.toml", unix_s=1_790_000_000.0 - 30 * 86_400.0) is not None
+    config = make_config(3, "fleet.epoch_unix_s=1790000000")
+    assert require_epoch(config, unix_s=1_790_000_000.0 - 30 * 86_400.0) is not None
 
 
 def test_the_health_says_while_ticks_fit_no_packet(make_config: MakeConfig) -> None:

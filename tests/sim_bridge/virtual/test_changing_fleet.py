@@ -37,7 +37,11 @@ PAPER_NOISE = (
     "mavlink.attitude_hz=25",
     "estimator.reciprocal_ranges=independent",
 )
-"""Of the five-drone mesh: sensors whose errors are what their covariances say."""
+"""Of the five-drone mesh: sensors whose errors are what their covariances say.
+
+Consistency (ANEES) is held to both sides: over 3 to 16 seeds a figure below varied within 0.55 to 1.3 (a drone that
+went silent), 0.89 to 1.9 (1.5 s after a late join), 0.60 to 1.6 (1 s of one drone), 0.76 to 1.4 (the first seconds).
+"""
 
 
 class Flight:
@@ -103,7 +107,7 @@ def test_a_drone_joins_where_it_is_located_and_not_before(changing: Flight) -> N
         before, after = changing.between(agent_id, 2.0, 3.0), changing.between(agent_id, 5.5, 6.0)
         assert {changing.present(ready) for ready in before} == {(1, 2, 4, 5)}
         assert {changing.present(ready) for ready in after} == {(1, 2, 3, 4, 5)}
-        assert changing.anees(agent_id, 5.0, 6.0, of=(3,)) < 2.0
+        assert 0.4 < changing.anees(agent_id, 5.0, 6.0, of=(3,)) < 2.0
     assert changing.own_error_m(3, 5.0, 6.0).max() < 0.3
 
 
@@ -123,7 +127,7 @@ def test_the_others_do_not_notice(changing: Flight) -> None:
         for from_s, to_s in ((6.0, 9.0), (9.0, 12.0), (12.0, 15.5)):
             assert np.sqrt(np.mean(np.square(changing.own_error_m(agent_id, from_s, to_s)))) < 1.6 * undisturbed
             assert changing.own_error_m(agent_id, from_s, to_s).max() < 0.15
-        assert changing.anees(agent_id, 1.5, 15.5) < 1.5
+        assert 0.7 < changing.anees(agent_id, 1.5, 15.5) < 1.5
         # nothing is made anew, no tick is lost
         assert changing.report.counters[agent_id]["starts"] == 1
         assert changing.report.counters[agent_id].get("estimator faults", 0) == 0
@@ -142,7 +146,7 @@ def test_the_age_and_the_variance_of_a_silent_drone_grow_as_the_process_noise_sa
     for ready, age in zip(found, ages, strict=True):
         # its last word was of the acceleration over the tick after its last fix
         assert flight.sigma_m(ready, 3) > silence_sigma_m((age - 1) * period_s, variance, period_s)
-    assert flight.anees(2, 4.2, 9.0) < 2.0
+    assert 0.4 < flight.anees(2, 4.2, 9.0) < 1.6
 
 
 def test_the_change_goes_through_sealed_packets_too() -> None:
@@ -164,7 +168,7 @@ def test_neighbours_who_see_other_fleets_still_exchange_pairs() -> None:
     for agent_id in (1, 2):
         assert flight.report.counters[agent_id]["information: other members"] > 0
         assert {flight.present(ready) for ready in flight.between(agent_id, 6.5, 8.0)} == {(1, 2, 3)}
-        assert flight.anees(agent_id, 6.5, 8.0) < 2.0
+        assert 0.6 < flight.anees(agent_id, 6.5, 8.0) < 2.0
 
 
 # --- starts ------------------------------------------------------------------------------------------------
@@ -177,7 +181,7 @@ def test_nobody_is_sure_of_a_wrong_place_in_the_first_seconds(seed: int, loss: f
         known = [r for r in flight.estimates[agent_id] if r.estimate.status is not Status.NO_DATA]
         start_s = known[0].t_s - flight.report.start_unix_s + flight.config.fleet.epoch_unix_s
         assert start_s < 1.6
-        assert flight.anees(agent_id, start_s, 6.0) < 2.0  # 614 (seed 2) when unheard drones were put somewhere
+        assert 0.6 < flight.anees(agent_id, start_s, 6.0) < 1.7  # 614 (seed 2) when unheard drones were put somewhere
 
 
 def test_a_drone_that_never_has_gps_is_not_observable_until_it_is_located() -> None:
@@ -195,7 +199,7 @@ def test_a_drone_that_never_has_gps_is_not_observable_until_it_is_located() -> N
             error = flight.error(each)[own]
             assert nees(error, each.estimate.covariance[np.ix_(own, own)]) / 6 < 8.0
     assert flight.own_error_m(5, 12.0, 14.0).max() < 0.5
-    assert flight.anees(1, 12.0, 14.0) < 2.0
+    assert 0.6 < flight.anees(1, 12.0, 14.0) < 2.0
 
 
 # --- partition ---------------------------------------------------------------------------------------------
@@ -210,7 +214,9 @@ def parted() -> Flight:
 def test_the_islands_of_a_partition_stay_consistent(parted: Flight) -> None:
     for agent_id in parted.config.ids:
         for from_s in range(4, 29, 5):
-            assert parted.anees(agent_id, from_s, from_s + 5) < 2.0
+            # who hears but one other is careful: 0.29 to 0.79 over seeds, all others 0.51 to 1.2
+            least = 0.2 if agent_id in (1, 2) and from_s < 24 else 0.5
+            assert least < parted.anees(agent_id, from_s, from_s + 5) < 1.6
 
 
 def test_who_is_on_the_other_side_ages_and_is_let_go_where_ranges_do_not_hold_it(parted: Flight) -> None:

@@ -15,7 +15,7 @@ RoundKey = tuple[int, int]
 """(tick, round)."""
 
 
-class Outcome(Enum):
+class PacketOutcome(Enum):
     """What became of a packet."""
 
     KEPT = auto()
@@ -78,20 +78,20 @@ class RoundBarrier(Generic[Item]):
         self._missing = {sender for sender in expected if sender not in here}
         self._expected = frozenset(expected)
 
-    def put(self, sender: int, tick: int, round_: int, item: Item) -> Outcome:
+    def put(self, sender: int, tick: int, round_: int, item: Item) -> PacketOutcome:
         """Keep a packet for its round, or say why not."""
         key = (tick, round_)
         if tick > self._tick + self._ticks_ahead or not 0 <= round_ < self._rounds:
-            return Outcome.WILD
+            return PacketOutcome.WILD
         if key <= self._floor:
-            return Outcome.LATE
+            return PacketOutcome.LATE
         items = self._box.setdefault(key, {})
         if sender in items:
-            return Outcome.DUPLICATE
+            return PacketOutcome.DUPLICATE
         items[sender] = item
         if key == self._current:
             self._missing.discard(sender)
-        return Outcome.KEPT
+        return PacketOutcome.KEPT
 
     def forget(self, sender: int) -> None:
         """Stop waiting for a neighbour that is gone."""

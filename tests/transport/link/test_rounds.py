@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from transport.link.rounds import Outcome, RoundBarrier
+from transport.link.rounds import PacketOutcome, RoundBarrier
 
 
 def barrier(rounds: int = 3) -> RoundBarrier[str]:
@@ -22,9 +22,9 @@ def test_a_round_ends_when_everybody_has_spoken() -> None:
     b = barrier()
     b.open(10, 0, {2, 3}, deadline_s=1.0)
     assert not b.done(0.0)
-    assert b.put(3, 10, 0, "c") is Outcome.KEPT
+    assert b.put(3, 10, 0, "c") is PacketOutcome.KEPT
     assert not b.done(0.5)
-    assert b.put(2, 10, 0, "b") is Outcome.KEPT
+    assert b.put(2, 10, 0, "b") is PacketOutcome.KEPT
     assert b.done(0.5)
     assert list(b.close().items()) == [(2, "b"), (3, "c")]
 
@@ -54,8 +54,8 @@ def test_a_deadline_in_the_past_does_not_block() -> None:
 
 def test_packets_may_come_before_their_round() -> None:
     b = barrier()
-    assert b.put(2, 10, 1, "early") is Outcome.KEPT
-    assert b.put(2, 12, 0, "next") is Outcome.KEPT
+    assert b.put(2, 10, 1, "early") is PacketOutcome.KEPT
+    assert b.put(2, 12, 0, "next") is PacketOutcome.KEPT
     b.open(10, 0, {2}, 1.0)
     assert not b.complete()
     b.close()
@@ -70,12 +70,12 @@ def test_late_duplicate_and_wild_packets_are_told_apart_and_not_used() -> None:
     b = barrier(rounds=2)
     b.open(10, 0, {2, 3}, 1.0)
     b.put(2, 10, 0, "first")
-    assert b.put(2, 10, 0, "second") is Outcome.DUPLICATE
+    assert b.put(2, 10, 0, "second") is PacketOutcome.DUPLICATE
     assert b.close() == {2: "first"}
-    assert b.put(3, 10, 0, "late") is Outcome.LATE
-    assert b.put(3, 9, 1, "older") is Outcome.LATE
-    assert b.put(3, 13, 0, "far ahead") is Outcome.WILD
-    assert b.put(3, 10, 2, "no such round") is Outcome.WILD
+    assert b.put(3, 10, 0, "late") is PacketOutcome.LATE
+    assert b.put(3, 9, 1, "older") is PacketOutcome.LATE
+    assert b.put(3, 13, 0, "far ahead") is PacketOutcome.WILD
+    assert b.put(3, 10, 2, "no such round") is PacketOutcome.WILD
     b.open(11, 0, {2, 3}, 1.0)
     assert b.close() == {}
 
@@ -117,7 +117,7 @@ def test_skipped_ticks_leave_nothing_behind() -> None:
         for tick in range(11, 1011):
             b.advance(tick)
             for round_ in range(3):
-                assert b.put(2, tick, round_, bytearray(10_000)) is Outcome.KEPT
+                assert b.put(2, tick, round_, bytearray(10_000)) is PacketOutcome.KEPT
         # THEN no more is held than what may still be asked for
         assert tracemalloc.get_traced_memory()[1] < 1_000_000
     finally:
@@ -137,7 +137,7 @@ def test_whatever_comes_every_packet_kept_is_handed_out_once(packets: list[tuple
     for tick in (10, 11, 12):
         for round_ in range(2):
             b.open(tick, round_, {2, 3, 4, 5}, deadline_s=tick + round_ / 2)
-            kept += [packet for packet in islice(feed, 8) if b.put(*packet, packet) is Outcome.KEPT]
+            kept += [packet for packet in islice(feed, 8) if b.put(*packet, packet) is PacketOutcome.KEPT]
             assert b.done(tick + round_ / 2)
             got = b.close()
             assert all(packet == (sender, tick, round_) for sender, packet in got.items())

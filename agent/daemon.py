@@ -21,7 +21,7 @@ from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
 from agent.exit_codes import ExitCode
-from agent.log.run_record import RunFiles
+from agent.log.run_logs import RunFiles
 from agent.mavlink.link import create_link
 from agent.mavlink.session import LinkState
 from agent.mavlink.signing_stamps import StampKeeper

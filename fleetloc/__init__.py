@@ -13,11 +13,11 @@ if TYPE_CHECKING:
     from agent.config.tables import FleetConfig
     from agent.errors import ConfigError, RecordError
     from estimators.estimator import Status
-    from fleetloc.api.logs import EstimateLog, read_estimate_log, read_flight_estimates, read_truth, replay_record
+    from fleetloc.api.logs import EstimateLog, read_estimate_log, read_flight_estimates, read_truth, replay_flight_log
     from fleetloc.api.observer import FleetObserver, Heard
     from fleetloc.api.uwb import UwbDriver
     from fleetloc.whole_config import load_whole as load_config
-    from sim_bridge.replay.record_replay import RecordReplay
+    from sim_bridge.replay.flight_log_replay import FlightLogReplay
     from sim_bridge.world.truth import Truth, TruthError
     from transport.errors import EncodeError, KeyFileError, SessionError
     from transport.messages.estimate_body import FleetEstimate
@@ -37,7 +37,7 @@ __all__ = [
     "Heard",
     "KeyFileError",
     "RecordError",
-    "RecordReplay",
+    "FlightLogReplay",
     "SessionError",
     "Status",
     "Truth",
@@ -51,7 +51,7 @@ __all__ = [
     "read_estimate_log",
     "read_flight_estimates",
     "read_truth",
-    "replay_record",
+    "replay_flight_log",
 ]
 
 _PLACES = {
@@ -59,11 +59,11 @@ _PLACES = {
     "agent.errors": ("ConfigError", "RecordError"),
     "estimators.estimator": ("Status",),
     "fleetloc.api.logs": (
-        "EstimateLog", "read_estimate_log", "read_flight_estimates", "read_truth", "replay_record",
+        "EstimateLog", "read_estimate_log", "read_flight_estimates", "read_truth", "replay_flight_log",
     ),
     "fleetloc.api.observer": ("FleetObserver", "Heard"),
     "fleetloc.api.uwb": ("UwbDriver",),
-    "sim_bridge.replay.record_replay": ("RecordReplay",),
+    "sim_bridge.replay.flight_log_replay": ("FlightLogReplay",),
     "sim_bridge.world.truth": ("Truth", "TruthError"),
     "transport.errors": ("EncodeError", "KeyFileError", "SessionError"),
     "transport.messages.estimate_body": ("FleetEstimate",),

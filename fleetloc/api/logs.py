@@ -15,7 +15,7 @@ from agent.log.flight_reader import FlightReader
 from agent.log.mcap_record import EstimateMessage
 from estimators.factory import make_estimator
 from estimators.model.layout import STATES_PER_AGENT
-from sim_bridge.replay import record_replay
+from sim_bridge.replay import flight_log_replay
 from sim_bridge.world.truth import Truth, load_truth
 
 Floats = NDArray[np.float64]
@@ -103,10 +103,10 @@ def read_truth(path: str | Path) -> Truth:
     return load_truth(Path(path))
 
 
-def replay_record(path: str | Path, config: FleetConfig | None = None) -> record_replay.RecordReplay:
+def replay_flight_log(path: str | Path, config: FleetConfig | None = None) -> record_replay.FlightLogReplay:
     """Repeat a flight record (``agent_001.mcap`` with its .tlog beside it) and compare with what was estimated.
 
     Without ``config`` it runs with the configuration it was flown with. Raises `RecordError`.
     """
-    (result,) = record_replay.replay_record([Path(path)], config, make_estimator)
+    (result,) = record_replay.replay_flight_log([Path(path)], config, make_estimator)
     return result

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import EstimateRecorder, RecordHeader
-from agent.log.run_record import ESTIMATES_MB, MB
+from agent.log.run_logs import ESTIMATES_MB, MB
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.factory import make_estimator

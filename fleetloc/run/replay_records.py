@@ -15,8 +15,8 @@ from agent.log.mcap_record import EstimateMcap
 from estimators.factory import make_estimator
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
+from sim_bridge.replay.flight_log_replay import FlightLogReplay, ReplayedTick, recorded_config, replay_flight_log
 from sim_bridge.replay.naming import names_apart
-from sim_bridge.replay.record_replay import RecordReplay, ReplayedTick, recorded_config, replay_record
 
 RECORDED = "recorded"
 """In place of a configuration: the one that each record was flown with."""
@@ -46,7 +46,7 @@ def replay_records(
                 writer.write(agent_id, tick.ready, tick.published_s)
 
         try:
-            rows += [_row(result) for result in replay_record([record], used, make_estimator, write)]
+            rows += [_row(result) for result in replay_flight_log([record], used, make_estimator, write)]
         finally:
             writer.close()
     _print(rows)
@@ -72,7 +72,7 @@ def _config(config: Path, record: Path, overrides: Sequence[Override]) -> FleetC
     return config_in_log(start.config, f"{record}: configuration", start.software, overrides)
 
 
-def _row(result: RecordReplay) -> dict[str, Any]:
+def _row(result: FlightLogReplay) -> dict[str, Any]:
     return {
         "record": result.path.name,
         "agent": result.agent_id,

@@ -14,7 +14,7 @@ from pymavlink import mavutil
 from agent.log.estimate_log import covariance_of, read_record
 from agent.log.flight_format import CLOSED, CUT_OFF
 from estimators.factory import make_estimator
-from sim_bridge.replay.record_replay import ReplayedTick, replay_record
+from sim_bridge.replay.flight_log_replay import ReplayedTick, replay_flight_log
 from tests.support.fleet_process import FleetProcess, until
 
 pytestmark = pytest.mark.slow
@@ -33,7 +33,7 @@ def test_the_records_of_a_live_run_give_its_estimates_again(start_fleet: Callabl
     # WHEN each record is repeated
     made: dict[int, list[ReplayedTick]] = {agent_id: [] for agent_id in AGENTS}
     records = [fleet.out / f"agent_{agent_id:03d}.mcap" for agent_id in AGENTS]
-    results = replay_record(records, None, make_estimator, lambda agent_id, tick: made[agent_id].append(tick))
+    results = replay_flight_log(records, None, make_estimator, lambda agent_id, tick: made[agent_id].append(tick))
     # THEN the estimates are those of the flight, up to the end or to the last flush
     for result in results:
         assert result.equal

@@ -12,9 +12,9 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.log.disk import DiskLimit
-from agent.log.flight_record import FlightRecord
+from agent.log.flight_log import FlightLog
 from agent.log.mcap_record import agent_key
-from agent.log.run_record import flight_start
+from agent.log.run_logs import flight_start
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.factory import make_estimator
@@ -50,7 +50,7 @@ class RecordedFleet:
         unix_s = START_FLEET_S + config.fleet.epoch_unix_s
         starts = {i: flight_start(config, i, trust, unix_s, HOST_START_S) for i in config.ids}
         self.records = {
-            i: FlightRecord(out / agent_key(i), config, start, limit, threaded=False) for i, start in starts.items()
+            i: FlightLog(out / agent_key(i), config, start, limit, threaded=False) for i, start in starts.items()
         }
         self.estimates: dict[int, list[EstimateReady]] = {i: [] for i in config.ids}
         rng = np.random.default_rng(seed)

@@ -49,7 +49,7 @@ OnTick = Callable[[int, ReplayedTick], None]
 
 
 @dataclass(slots=True)
-class RecordReplay:
+class FlightLogReplay:
     """How the replay of one record went.
 
     ``max_mean_difference`` and ``max_sigma_difference`` between estimates of the same tick, in m and m/s.
@@ -89,12 +89,12 @@ class RecordReplay:
         return complete and not self.contradicted and difference <= TOLERANCE
 
 
-def replay_record(
+def replay_flight_log(
     paths: Sequence[Path],
     config: FleetConfig | None,
     make_estimator: EstimatorFactory,
     on_tick: OnTick | None = None,
-) -> list[RecordReplay]:
+) -> list[FlightLogReplay]:
     """Repeat the runs in flight records (.mcap, each with its .tlog beside it), one after the other.
 
     Without ``config`` each runs with the configuration it was flown with. Estimates go to ``on_tick`` as they are
@@ -113,7 +113,7 @@ def recorded_config(start: FlightStart, path: Path) -> FleetConfig:
 
 def _replay_one(
     path: Path, config: FleetConfig | None, make_estimator: EstimatorFactory, on_tick: OnTick | None
-) -> RecordReplay:
+) -> FlightLogReplay:
     reader = FlightReader(path)
     start = reader.start
     used = recorded_config(start, path) if config is None else config
@@ -127,7 +127,7 @@ def _replay_one(
         unix_s=start.unix_s,
         host_s=start.host_s,
     )
-    result = RecordReplay(path, start.agent, used)
+    result = FlightLogReplay(path, start.agent, used)
     pairing = _Pairing(result, on_tick)
     for entry in reader:
         if isinstance(entry, RecordedInput):
@@ -146,7 +146,7 @@ def _replay_one(
 class _Pairing:
     """Brings estimates made again and recorded ones of the same tick together, in the order of their making."""
 
-    def __init__(self, result: RecordReplay, on_tick: OnTick | None) -> None:
+    def __init__(self, result: FlightLogReplay, on_tick: OnTick | None) -> None:
         self._result = result
         self._on_tick = on_tick
         self._made: deque[ReplayedTick] = deque()

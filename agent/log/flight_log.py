@@ -47,7 +47,7 @@ _Entry = tuple[Input | _Sent | _Estimate, float]
 """What and its UTC instant."""
 
 
-class FlightRecord:
+class FlightLog:
     """A `Journal` on disk. ``counters`` has what was taken down and what not; ``ended`` why it ended, else empty."""
 
     def __init__(

@@ -19,13 +19,13 @@ from agent.config.reading import config_from, dump
 from agent.config.tables import FleetConfig
 from agent.errors import RecordError
 from agent.inputs import Due, Gone, HouseKept, Input, MavlinkIn, PacketIn, Served, UwbIn
-from agent.log import flight_record
+from agent.log import flight_log
 from agent.log.disk import DiskLimit
 from agent.log.flight_format import CLOSED, CUT_OFF, trust_from, trust_text
+from agent.log.flight_log import FlightLog
 from agent.log.flight_reader import FlightReader, RecordedEntry, RecordedInput
-from agent.log.flight_record import FlightRecord
 from agent.log.mcap_record import CHUNK_BYTES, EstimateMcap, EstimateMessage
-from agent.log.run_record import flight_start
+from agent.log.run_logs import flight_start
 from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, SolverReport, Status
@@ -47,10 +47,10 @@ def config() -> FleetConfig:
     return config_from(document, "test")
 
 
-def make_record(directory: Path, config: FleetConfig, *, threaded: bool = False, **limits: Any) -> FlightRecord:
+def make_record(directory: Path, config: FleetConfig, *, threaded: bool = False, **limits: Any) -> FlightLog:
     limit = DiskLimit(directory, limits.get("max_bytes", ROOM), 1000, limits.get("free", lambda _: ROOM))
     start = flight_start(config, 1, UNSIGNED, UNIX_S + HOST_S, HOST_S)
-    return FlightRecord(directory / "agent_001", config, start, limit, threaded=threaded)
+    return FlightLog(directory / "agent_001", config, start, limit, threaded=threaded)
 
 
 def ready(tick: int) -> EstimateReady:
@@ -62,7 +62,7 @@ def heartbeat(encoder: Encoder) -> bytes:
     return encoder.encode(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3))
 
 
-def write_flight(record: FlightRecord, ticks: int) -> list[Input]:
+def write_flight(record: FlightLog, ticks: int) -> list[Input]:
     """Inputs of every sort and an estimate per tick."""
     encoder, decoder = Encoder(1, 1), Decoder(datagrams=True)
     rng, inputs = np.random.default_rng(1), []
@@ -266,7 +266,7 @@ def test_a_record_that_cannot_be_made_is_an_error_at_once(tmp_path: Path, config
 
 
 def expect_early_end(
-    record: FlightRecord, caplog: pytest.LogCaptureFixture, reason: str, whole: bool
+    record: FlightLog, caplog: pytest.LogCaptureFixture, reason: str, whole: bool
 ) -> tuple[list[Input], list[Input]]:
     """Written and read inputs of a record that ends early; nothing raises, and it is said once."""
     with caplog.at_level(logging.WARNING, "fleetloc.agent"):

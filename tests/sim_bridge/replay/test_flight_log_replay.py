@@ -25,7 +25,7 @@ from agent.log.flight_format import CLOSED, CUT_OFF
 from agent.outputs import EstimateReady
 from estimators.estimator import Status
 from estimators.factory import make_estimator
-from sim_bridge.replay.record_replay import RecordReplay, ReplayedTick, replay_record
+from sim_bridge.replay.flight_log_replay import FlightLogReplay, ReplayedTick, replay_flight_log
 from sim_bridge.world.scenario import Reboot
 from tests.support.recorded_fleet import ROOM, RecordedFleet
 from transport.link.streams import Stream
@@ -40,9 +40,9 @@ def record_of(fleet: RecordedFleet, agent_id: int) -> Path:
 
 def repeat(
     fleet: RecordedFleet, agent_id: int, config: FleetConfig | None = None
-) -> tuple[RecordReplay, list[ReplayedTick]]:
+) -> tuple[FlightLogReplay, list[ReplayedTick]]:
     ticks: list[ReplayedTick] = []
-    (result,) = replay_record(
+    (result,) = replay_flight_log(
         [record_of(fleet, agent_id)], config, make_estimator, lambda i, tick: ticks.append(tick)
     )
     return result, ticks
@@ -57,7 +57,7 @@ def same(one: EstimateReady, other: EstimateReady) -> bool:
     )
 
 
-def expect_equal(fleet: RecordedFleet, agent_id: int, share: slice = slice(None)) -> RecordReplay:
+def expect_equal(fleet: RecordedFleet, agent_id: int, share: slice = slice(None)) -> FlightLogReplay:
     """The replay gives the live estimates (of a part of the flight) and what is counted."""
     result, ticks = repeat(fleet, agent_id)
     made = [tick.ready for tick in ticks if tick.ready is not None]
@@ -181,7 +181,7 @@ def test_a_run_is_equal_only_if_status_and_ages_are_too(
 ) -> None:
     # GIVEN a flight log one of whose estimates says something else in a single place
     path = retold(record_of(flown, 1), tmp_path, change)
-    (result,) = replay_record([path], None, make_estimator)
+    (result,) = replay_flight_log([path], None, make_estimator)
     # THEN only rounding passes for equal
     assert result.complete
     assert (result.contradicted, result.different, result.equal) == (contradicted, different, equal)

@@ -12,7 +12,7 @@ from agent.config.tables import FleetConfig
 from agent.log.disk import DiskLimit
 from agent.log.estimate_log import SUFFIX, EstimateRecorder, RecordHeader, write_summary
 from agent.log.flight_format import FlightStart, trust_text
-from agent.log.flight_record import FlightRecord
+from agent.log.flight_log import FlightLog
 from agent.log.mcap_record import agent_key
 from agent.outputs import EstimateReady
 from agent.watch.observers import DaemonState, Observer
@@ -43,10 +43,10 @@ class RunFiles(Observer):
             epoch_unix_s=config.fleet.epoch_unix_s,
         )
         self._estimates = EstimateRecorder(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
-        self.flight: FlightRecord | None = None
+        self.flight: FlightLog | None = None
         if settings.flight:
             limit = DiskLimit(directory, int(settings.flight_max_mb * MB), int(settings.min_free_mb * MB))
-            self.flight = FlightRecord(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
+            self.flight = FlightLog(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
 
     def counters(self) -> dict[str, int]:
         """What was not written, and how far the flight record is."""

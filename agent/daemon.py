@@ -19,7 +19,7 @@ from typing import Any
 from agent.config.endpoints import parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
-from agent.errors import AgentError, ConfigError, LinkError, NoAutopilotError, RecordError
+from agent.errors import AgentError, ConfigError, LinkError, LogFileError, NoAutopilotError
 from agent.exit_codes import ExitCode
 from agent.log.run_logs import RunFiles
 from agent.mavlink.link import create_link
@@ -62,7 +62,7 @@ EXIT_CODE_OF: tuple[tuple[type[Exception], ExitCode], ...] = (
     (UnwritableError, ExitCode.STATE),
     (KeyFileError, ExitCode.KEYS),
     (SessionError, ExitCode.SESSION),
-    (RecordError, ExitCode.RECORD),
+    (LogFileError, ExitCode.RECORD),
 )
 
 

@@ -5,7 +5,7 @@ AgentError
 ├── EndpointError      an address of a MAVLink link cannot be understood
 ├── LinkError          a MAVLink link cannot be opened (port taken, no such device)
 ├── NoAutopilotError   no autopilot appeared in time
-├── RecordError        a record cannot be written or read
+├── LogFileError        a record cannot be written or read
 └── SecurityError      something that the security profile promises is missing
 """
 
@@ -73,7 +73,7 @@ class NoAutopilotError(AgentError):
     """No autopilot appeared on the link in time."""
 
 
-class RecordError(AgentError):
+class LogFileError(AgentError):
     """A record that cannot be written or read."""
 
 

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from agent.config.tables import FleetConfig
-    from agent.errors import ConfigError, RecordError
+    from agent.errors import ConfigError, LogFileError
     from estimators.estimator import Status
     from fleetloc.api.logs import EstimateLog, read_estimate_log, read_flight_estimates, read_truth, replay_flight_log
     from fleetloc.api.observer import FleetObserver, Heard
@@ -36,7 +36,7 @@ __all__ = [
     "FleetObserver",
     "Heard",
     "KeyFileError",
-    "RecordError",
+    "LogFileError",
     "FlightLogReplay",
     "SessionError",
     "Status",
@@ -56,7 +56,7 @@ __all__ = [
 
 _PLACES = {
     "agent.config.tables": ("FleetConfig",),
-    "agent.errors": ("ConfigError", "RecordError"),
+    "agent.errors": ("ConfigError", "LogFileError"),
     "estimators.estimator": ("Status",),
     "fleetloc.api.logs": (
         "EstimateLog", "read_estimate_log", "read_flight_estimates", "read_truth", "replay_flight_log",

@@ -15,7 +15,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.outputs import EstimateReady
 from estimators.model.layout import Layout
 from estimators.model.measurements import Matrix
@@ -28,7 +28,7 @@ CHUNK_NUMBERS = 1_000_000
 """Size of the largest table that is held at a time where a record is read piece by piece, in numbers."""
 
 
-class RecordHeader(msgspec.Struct, frozen=True, kw_only=True):
+class EstimateLogHeader(msgspec.Struct, frozen=True, kw_only=True):
     """First line of a file."""
 
     format: str = FORMAT
@@ -58,11 +58,11 @@ def entry_dtype(agents: int) -> np.dtype[Any]:
     )
 
 
-class EstimateRecorder:
+class EstimateLogWriter:
     """Appends estimates to a file until it is full; then the agent goes on without."""
 
-    def __init__(self, path: Path, header: RecordHeader, max_bytes: int) -> None:
-        """Make the file anew; raises `RecordError` if that cannot be done."""
+    def __init__(self, path: Path, header: EstimateLogHeader, max_bytes: int) -> None:
+        """Make the file anew; raises `LogFileError` if that cannot be done."""
         self.path = path
         self.written = 0
         """Entries written."""
@@ -77,7 +77,7 @@ class EstimateRecorder:
             self._file = path.open("wb")
             self._file.write(msgspec.json.encode(header) + b"\n")
         except OSError as error:
-            raise RecordError(f"record {path}: cannot be written: {error.strerror}") from error
+            raise LogFileError(f"record {path}: cannot be written: {error.strerror}") from error
 
     def write(self, ready: EstimateReady, published_s: float, tick_time_s: float) -> None:
         """Append one estimate."""
@@ -110,19 +110,19 @@ class EstimateRecorder:
             self.skipped += 1
 
 
-def read_record(path: Path) -> tuple[RecordHeader, NDArray[np.void]]:
-    """Header and entries of a file; raises `RecordError` naming the file and what is wrong."""
+def read_entries(path: Path) -> tuple[EstimateLogHeader, NDArray[np.void]]:
+    """Header and entries of a file; raises `LogFileError` naming the file and what is wrong."""
     try:
         raw = path.read_bytes()
     except OSError as error:
-        raise RecordError(f"record {path}: cannot be read: {error.strerror}") from error
+        raise LogFileError(f"record {path}: cannot be read: {error.strerror}") from error
     line, newline, content = raw.partition(b"\n")
     try:
-        header = msgspec.json.decode(line, type=RecordHeader)
+        header = msgspec.json.decode(line, type=EstimateLogHeader)
     except msgspec.DecodeError as error:
-        raise RecordError(f"record {path}: expected a first line of {FORMAT}: {error}") from error
+        raise LogFileError(f"record {path}: expected a first line of {FORMAT}: {error}") from error
     if header.format != FORMAT or not newline:
-        raise RecordError(f"record {path}: expected {FORMAT}, found {header.format!r}")
+        raise LogFileError(f"record {path}: expected {FORMAT}, found {header.format!r}")
     dtype = entry_dtype(len(header.agents))
     whole = len(content) // dtype.itemsize
     return header, np.frombuffer(content, dtype, whole)
@@ -147,8 +147,8 @@ def covariance_of(entry: NDArray[np.void] | np.void, agents: int) -> Matrix:
 
 
 def write_summary(path: Path, summary: dict[str, Any]) -> None:
-    """The counters of a finished run beside its record; raises `RecordError`."""
+    """The counters of a finished run beside its record; raises `LogFileError`."""
     try:
         path.write_text(json.dumps(summary, indent=1, sort_keys=True) + "\n", encoding="utf-8")
     except OSError as error:
-        raise RecordError(f"summary {path}: cannot be written: {error.strerror}") from error
+        raise LogFileError(f"summary {path}: cannot be written: {error.strerror}") from error

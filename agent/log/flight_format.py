@@ -12,9 +12,9 @@ from typing import Any
 import msgspec
 from nacl.signing import VerifyKey
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.inputs import Due, Gone, HouseKept, Input, MavlinkIn, PacketIn, Served, UwbIn
-from agent.log.mcap_record import agent_key
+from agent.log.estimate_mcap import agent_key
 from transport.security.auth import UNSIGNED, Trust, Unsigned, public_hex
 
 FORMAT = "fleetloc-flight/1"
@@ -105,24 +105,24 @@ def trust_text(trust: Trust) -> str:
 
 
 def trust_from(text: str) -> Trust:
-    """The keys in a text of `trust_text`; raises `RecordError`."""
+    """The keys in a text of `trust_text`; raises `LogFileError`."""
     if text == "unsigned":
         return UNSIGNED
     try:
         keys = msgspec.json.decode(text, type=dict[int, list[str]])
         return {agent_id: tuple(VerifyKey(bytes.fromhex(key)) for key in each) for agent_id, each in keys.items()}
     except (msgspec.DecodeError, ValueError) as error:
-        raise RecordError(f"public keys: expected JSON of agent ids and hexadecimal keys: {error}") from error
+        raise LogFileError(f"public keys: expected JSON of agent ids and hexadecimal keys: {error}") from error
 
 
 def start_from(texts: dict[str, str]) -> FlightStart:
-    """The begin of a record from its metadata; raises `RecordError`."""
+    """The begin of a record from its metadata; raises `LogFileError`."""
     try:
         start = msgspec.convert(texts, FlightStart, strict=False)
     except msgspec.ValidationError as error:
-        raise RecordError(f"metadata {START}: {error}") from error
+        raise LogFileError(f"metadata {START}: {error}") from error
     if start.format != FORMAT:
-        raise RecordError(f"expected {FORMAT}, found {start.format[:40]!r}")
+        raise LogFileError(f"expected {FORMAT}, found {start.format[:40]!r}")
     return start
 
 

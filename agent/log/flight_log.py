@@ -17,11 +17,11 @@ from pathlib import Path
 import msgspec
 
 from agent.config.tables import FleetConfig
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.inputs import Input, MavlinkIn
 from agent.log.disk import DiskLimit
+from agent.log.estimate_mcap import SUFFIX, EstimateChannels, McapFile
 from agent.log.flight_format import CLOSED, END, NAMES, START, FlightStart, input_schema, input_topic, lay
-from agent.log.mcap_record import SUFFIX, EstimateChannels, McapFile
 from agent.log.tlog import SUFFIX as TLOG_SUFFIX
 from agent.log.tlog import TlogWriter
 from agent.outputs import EstimateReady
@@ -53,7 +53,7 @@ class FlightLog:
     def __init__(
         self, stem: Path, config: FleetConfig, start: FlightStart, limit: DiskLimit, *, threaded: bool = True
     ) -> None:
-        """Make ``stem`` .tlog and .mcap anew; raises `RecordError` if that cannot be done.
+        """Make ``stem`` .tlog and .mcap anew; raises `LogFileError` if that cannot be done.
 
         Without a thread, everything is written as it is handed over.
         """
@@ -166,7 +166,7 @@ class _Files:
                 self._mcap.metadata(START, start.texts())
                 opened.pop_all()
         except OSError as error:
-            raise RecordError(f"record {stem}{SUFFIX}: cannot be written: {error.strerror or error}") from error
+            raise LogFileError(f"record {stem}{SUFFIX}: cannot be written: {error.strerror or error}") from error
         fleet = config.fleet
         self._estimates = EstimateChannels(self._mcap, config.ids, fleet.period_s, fleet.epoch_unix_s)
         self._schemas = {kind: input_schema(kind) for kind in NAMES}

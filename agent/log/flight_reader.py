@@ -14,10 +14,10 @@ from mcap.exceptions import McapError
 from mcap.records import Channel, Message, Metadata
 from mcap.stream_reader import StreamReader
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.inputs import Input, MavlinkIn
+from agent.log.estimate_mcap import EstimateMessage, estimate_topic
 from agent.log.flight_format import CUT_OFF, END, KINDS, START, FlightStart, MavlinkLaid, input_topic, start_from
-from agent.log.mcap_record import EstimateMessage, estimate_topic
 from agent.log.tlog import SUFFIX as TLOG_SUFFIX
 from agent.log.tlog import read_frames
 
@@ -52,14 +52,14 @@ class FlightReader:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open ``path`` (.mcap); the .tlog is beside it. Raises `RecordError` if it is no flight record."""
+        """Open ``path`` (.mcap); the .tlog is beside it. Raises `LogFileError` if it is no flight record."""
         self.path = path
         self.ended = ""
         try:
             with path.open("rb") as stream:
                 self.start = self._start(stream)
         except OSError as error:
-            raise RecordError(f"record {path}: cannot be read: {error.strerror}") from error
+            raise LogFileError(f"record {path}: cannot be read: {error.strerror}") from error
 
     def __iter__(self) -> Iterator[RecordedEntry]:
         self.ended = CUT_OFF
@@ -67,7 +67,7 @@ class FlightReader:
             with self.path.open("rb") as stream, self.path.with_suffix(TLOG_SUFFIX).open("rb") as tlog:
                 yield from self._entries(stream, tlog)
         except OSError as error:
-            raise RecordError(f"record {self.path}: cannot be read: {error.filename}: {error.strerror}") from error
+            raise LogFileError(f"record {self.path}: cannot be read: {error.filename}: {error.strerror}") from error
         except _Gap as gap:
             self.ended = f"{CUT_OFF}: {gap}"
         except _BROKEN as error:
@@ -81,11 +81,11 @@ class FlightReader:
                     return start_from(record.metadata)
                 if isinstance(record, Message):
                     break
-        except RecordError as error:
-            raise RecordError(f"{where}: {error}") from error
+        except LogFileError as error:
+            raise LogFileError(f"{where}: {error}") from error
         except _BROKEN as error:
-            raise RecordError(f"{where} (MCAP): {type(error).__name__}") from error
-        raise RecordError(f"{where}, found MCAP without metadata {START!r}")
+            raise LogFileError(f"{where} (MCAP): {type(error).__name__}") from error
+        raise LogFileError(f"{where}, found MCAP without metadata {START!r}")
 
     def _entries(self, stream: IO[bytes], tlog: IO[bytes]) -> Iterator[RecordedEntry]:
         agent_id = self.start.agent

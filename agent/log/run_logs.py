@@ -10,10 +10,10 @@ from pathlib import Path
 from agent.config.reading import dump
 from agent.config.tables import FleetConfig
 from agent.log.disk import DiskLimit
-from agent.log.estimate_log import SUFFIX, EstimateRecorder, RecordHeader, write_summary
+from agent.log.estimate_log import SUFFIX, EstimateLogHeader, EstimateLogWriter, write_summary
+from agent.log.estimate_mcap import agent_key
 from agent.log.flight_format import FlightStart, trust_text
 from agent.log.flight_log import FlightLog
-from agent.log.mcap_record import agent_key
 from agent.outputs import EstimateReady
 from agent.watch.observers import DaemonState, Observer
 from transport.security.auth import Trust
@@ -31,18 +31,18 @@ class RunFiles(Observer):
     def __init__(
         self, config: FleetConfig, agent_id: int, directory: Path, trust: Trust, *, unix_s: float, host_s: float
     ) -> None:
-        """Make the files anew; raises `RecordError`. The times are those that the agent's clock began with."""
+        """Make the files anew; raises `LogFileError`. The times are those that the agent's clock began with."""
         settings = config.record
         self._epoch_unix_s = config.fleet.epoch_unix_s
         stem = directory / agent_key(agent_id)
-        header = RecordHeader(
+        header = EstimateLogHeader(
             fleet=config.fleet.name,
             agent=agent_id,
             agents=config.ids,
             period_s=config.fleet.period_s,
             epoch_unix_s=config.fleet.epoch_unix_s,
         )
-        self._estimates = EstimateRecorder(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
+        self._estimates = EstimateLogWriter(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
         self.flight: FlightLog | None = None
         if settings.flight:
             limit = DiskLimit(directory, int(settings.flight_max_mb * MB), int(settings.min_free_mb * MB))
@@ -63,7 +63,7 @@ class RunFiles(Observer):
             self.flight.hand_over()
 
     async def close(self, state: DaemonState) -> None:
-        """Write everything out, and the counters beside it; raises `RecordError` if those cannot be written."""
+        """Write everything out, and the counters beside it; raises `LogFileError` if those cannot be written."""
         self._estimates.close()
         if self.flight is not None:
             await asyncio.to_thread(self.flight.close)

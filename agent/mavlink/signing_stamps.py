@@ -8,7 +8,7 @@ from pathlib import Path
 
 import msgspec
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.mavlink.signing import LinkSigning, Stamps
 from agent.watch.observers import DaemonState, Observer
 from transport.errors import KeyFileError
@@ -36,11 +36,11 @@ class StampFile:
             raise KeyFileError(f"{self.path}: not the stamps of a MAVLink link ({error}); remove the file") from None
 
     def save(self, stamps: Stamps) -> None:
-        """Keep stamps; raises `RecordError`."""
+        """Keep stamps; raises `LogFileError`."""
         try:
             write_text(self.path, msgspec.json.encode(stamps).decode("ascii"), PRIVATE)
         except KeyFileError as error:
-            raise RecordError(str(error)) from None
+            raise LogFileError(str(error)) from None
 
 
 class StampKeeper(Observer):
@@ -66,5 +66,5 @@ class StampKeeper(Observer):
     async def _save(self) -> None:
         try:
             await asyncio.to_thread(self._file.save, self._signing.stamps)
-        except RecordError as error:  # a full disk does not end a flight
+        except LogFileError as error:  # a full disk does not end a flight
             LOG.warning("mavlink signing: %s", error)

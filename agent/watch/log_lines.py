@@ -9,7 +9,7 @@ from logging.handlers import RotatingFileHandler
 from pathlib import Path
 
 from agent.config.observer_tables import LogTable
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.log.disk import free_bytes
 
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
@@ -36,7 +36,7 @@ def configure_logging(verbosity: int = 1, file: logging.Handler | None = None) -
 
 
 def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_bytes) -> logging.Handler | None:
-    """The log file of an agent, ``None`` where none is asked for; raises `RecordError` if it cannot be written."""
+    """The log file of an agent, ``None`` where none is asked for; raises `LogFileError` if it cannot be written."""
     if table.directory is None:
         return None
     path = Path(table.directory) / f"agent_{agent_id:03d}.log"
@@ -45,7 +45,7 @@ def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_
         limits = MAX_BYTES, KEEP, MIN_FREE_BYTES
         return LimitedLogFile(path, *limits, free)
     except OSError as error:
-        raise RecordError(f"log {path}: cannot be written: {error.strerror or error}") from error
+        raise LogFileError(f"log {path}: cannot be written: {error.strerror or error}") from error
 
 
 class LimitedLogFile(RotatingFileHandler):

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.log import estimate_log
+from agent.log.estimate_mcap import EstimateMessage
 from agent.log.flight_reader import FlightReader
-from agent.log.mcap_record import EstimateMessage
 from estimators.factory import make_estimator
 from estimators.model.layout import STATES_PER_AGENT
 from sim_bridge.replay import flight_log_replay
@@ -71,8 +71,8 @@ class EstimateLog:
 
 
 def read_estimate_log(path: str | Path) -> EstimateLog:
-    """Read ``agent_001.estimates``, also of a run that goes on or was killed; raises `RecordError`."""
-    header, entries = estimate_log.read_record(Path(path))
+    """Read ``agent_001.estimates``, also of a run that goes on or was killed; raises `LogFileError`."""
+    header, entries = estimate_log.read_entries(Path(path))
     count, n = len(entries), len(header.agents)
     rows, columns = np.triu_indices(STATES_PER_AGENT * n)
     mean = entries["mean"].reshape(count, n, STATES_PER_AGENT)
@@ -91,7 +91,7 @@ def read_flight_estimates(path: str | Path) -> Iterator[EstimateMessage]:
     """The estimates in a flight record (``agent_001.mcap`` with its .tlog beside it), in their order.
 
     Each has ``tick``, ``t_s``, ``published_s``, ``status``, ``on_time``, ``agents`` by name (``agent_001``) and
-    ``arrays()``, mean and 1-sigma ``(6n,)``. Raises `RecordError`.
+    ``arrays()``, mean and 1-sigma ``(6n,)``. Raises `LogFileError`.
     """
     for entry in FlightReader(Path(path)):
         if isinstance(entry, EstimateMessage):
@@ -106,7 +106,7 @@ def read_truth(path: str | Path) -> Truth:
 def replay_flight_log(path: str | Path, config: FleetConfig | None = None) -> record_replay.FlightLogReplay:
     """Repeat a flight record (``agent_001.mcap`` with its .tlog beside it) and compare with what was estimated.
 
-    Without ``config`` it runs with the configuration it was flown with. Raises `RecordError`.
+    Without ``config`` it runs with the configuration it was flown with. Raises `LogFileError`.
     """
     (result,) = record_replay.replay_flight_log([Path(path)], config, make_estimator)
     return result

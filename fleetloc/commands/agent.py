@@ -46,7 +46,7 @@ def agent(
 
     from agent.config.reading import load_config
     from agent.daemon import run
-    from agent.errors import ConfigError, RecordError
+    from agent.errors import ConfigError, LogFileError
     from agent.exit_codes import ExitCode
     from agent.sensing.clock import require_epoch
     from agent.watch.log_lines import configure_logging, log_file
@@ -65,7 +65,7 @@ def agent(
     try:
         configure_logging(0 if quiet else 1 + verbose, log_file(fleet.log, agent_id))
         observers = observers_of(fleet, agent_id, config.parent) if agent_id in fleet.ids else []
-    except RecordError as error:
+    except LogFileError as error:
         raise NotStarted(str(error), ExitCode.RECORD) from error
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.BAD_INPUT) from error

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.fleet.membership import is_absent
-from agent.log.estimate_log import covariance_of, entry_dtype, read_record
+from agent.log.estimate_log import covariance_of, entry_dtype, read_entries
 from estimators.estimator import Status
 from estimators.integrity.consistency import nees
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
@@ -64,7 +64,7 @@ class FleetResults:
 
 
 def load_results(config: FleetConfig, directory: Path) -> FleetResults:
-    """Read the truth and every record; raises `TruthError` or `RecordError` naming the file that cannot be used."""
+    """Read the truth and every record; raises `TruthError` or `LogFileError` naming the file that cannot be used."""
     truth = load_truth(directory / run_files.TRUTH)
     start_unix_s, end_unix_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
     tracks = tuple(_track(config, directory, agent_id, truth) for agent_id in config.ids)
@@ -75,7 +75,7 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     period_s, epoch_s = config.fleet.period_s, config.fleet.epoch_unix_s
     start_s, end_s = (float(truth.time_unix_s[i]) - epoch_s for i in (0, -1))
     paths = run_files.records(directory, agent_id)
-    parts = [read_record(path)[1] for path in paths]
+    parts = [read_entries(path)[1] for path in paths]
     entries = np.concatenate(parts) if parts else np.empty(0, entry_dtype(len(config.ids)))
     # the ticks that began and ended while the world moved
     inside = (entries["t_s"] >= start_s - ROUNDING_S) & (entries["t_s"] + period_s <= end_s + ROUNDING_S)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import covariance_of, record_chunks
-from agent.log.mcap_record import EstimateMcap
+from agent.log.estimate_mcap import EstimateMcap
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, Status
 from estimators.model.layout import STATES_PER_AGENT, Layout
@@ -32,7 +32,7 @@ def exporting(
 ) -> Iterator[None]:
     """Make the files of `export` beside what is done within; there when it ends.
 
-    Raises `OSError`, `RecordError`, and `InputError` where the process that makes them was killed.
+    Raises `OSError`, `LogFileError`, and `InputError` where the process that makes them was killed.
     """
     task = (directory, config, tuple(agents), start_s, epoch_unix_s)
     if not side_process.may_fork():

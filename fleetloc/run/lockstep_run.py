@@ -6,7 +6,7 @@ import gc
 from pathlib import Path
 
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
 from agent.log.run_logs import ESTIMATES_MB, MB
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
@@ -23,9 +23,9 @@ def fly_in_lockstep(config: FleetConfig, directory: Path) -> RunOutcome:
     """Fly the scenario and write truth and records; there is no computing time in virtual time, it is given as 0."""
     fleet = config.fleet
     recorders = {
-        agent_id: EstimateRecorder(
+        agent_id: EstimateLogWriter(
             run_files.record_path(directory, agent_id),
-            RecordHeader(
+            EstimateLogHeader(
                 fleet=fleet.name,
                 agent=agent_id,
                 agents=config.ids,

@@ -10,8 +10,8 @@ from agent.config.documents import Override
 from agent.config.reading import load_config
 from agent.config.reading import recorded_config as config_in_log
 from agent.config.tables import FleetConfig
+from agent.log.estimate_mcap import EstimateMcap
 from agent.log.flight_reader import FlightReader
-from agent.log.mcap_record import EstimateMcap
 from estimators.factory import make_estimator
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
@@ -30,7 +30,7 @@ def replay_records(
 
     Writes the estimates made again as ``agent_001.again.mcap`` (``A-agent_001.again.mcap`` where only their folders
     tell records apart) and the comparison as ``report.json``. Another configuration or ``overrides`` (``key=value``)
-    answer what would have been estimated with them. Raises `RecordError`, `ConfigError`, `InputError`.
+    answer what would have been estimated with them. Raises `LogFileError`, `ConfigError`, `InputError`.
     """
     folder.mkdir(parents=True, exist_ok=True)
     names = names_apart(records)

@@ -23,7 +23,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.samples import AutopilotEstimate, GpsSample
@@ -115,10 +115,10 @@ class ReplayWriter:
     def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
         self.latency: dict[int, Thinned] = {}
         self._noted_s: dict[int, float] = {}
-        self._recorders: dict[int, EstimateRecorder] = {}
+        self._recorders: dict[int, EstimateLogWriter] = {}
         fleet = config.fleet
         for agent_id in agents:
-            header = RecordHeader(
+            header = EstimateLogHeader(
                 fleet=fleet.name,
                 agent=agent_id,
                 agents=config.ids,
@@ -126,7 +126,7 @@ class ReplayWriter:
                 epoch_unix_s=fleet.epoch_unix_s,
             )
             record = run_files.record_path(directory, agent_id)
-            self._recorders[agent_id] = EstimateRecorder(record, header, sys.maxsize)
+            self._recorders[agent_id] = EstimateLogWriter(record, header, sys.maxsize)
 
     def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
         """Write an estimate, and note the latency now and then."""

@@ -12,7 +12,7 @@ import msgspec
 from agent.config.documents import Override, read_document
 from agent.config.reading import config_of
 from agent.config.tables import FleetConfig
-from agent.log.mcap_record import SUFFIX as RECORD_SUFFIX
+from agent.log.estimate_mcap import SUFFIX as RECORD_SUFFIX
 from agent.sensing.frames import FleetFrame
 from fleetloc.errors import InputError
 from sim_bridge.replay.feed import Inputs

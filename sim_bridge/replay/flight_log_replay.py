@@ -17,10 +17,10 @@ import numpy as np
 from agent.config.reading import recorded_config as config_in_log
 from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
-from agent.errors import AgentError, RecordError
+from agent.errors import AgentError, LogFileError
+from agent.log.estimate_mcap import EstimateMessage, estimate_message
 from agent.log.flight_format import CLOSED, FlightStart, trust_from
 from agent.log.flight_reader import FlightReader, RecordedInput
-from agent.log.mcap_record import EstimateMessage, estimate_message
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from transport.security.auth import Identity
@@ -98,17 +98,17 @@ def replay_flight_log(
     """Repeat the runs in flight records (.mcap, each with its .tlog beside it), one after the other.
 
     Without ``config`` each runs with the configuration it was flown with. Estimates go to ``on_tick`` as they are
-    made; nothing is kept of them. Raises `RecordError` for a file that is no flight record or has no .tlog.
+    made; nothing is kept of them. Raises `LogFileError` for a file that is no flight record or has no .tlog.
     """
     return [_replay_one(path, config, make_estimator, on_tick) for path in paths]
 
 
 def recorded_config(start: FlightStart, path: Path) -> FleetConfig:
-    """The configuration that a record was flown with; raises `RecordError`."""
+    """The configuration that a record was flown with; raises `LogFileError`."""
     try:
         return config_in_log(start.config, "configuration", start.software)
     except AgentError as error:
-        raise RecordError(f"record {path}: its configuration cannot be used: {error}") from error
+        raise LogFileError(f"record {path}: its configuration cannot be used: {error}") from error
 
 
 def _replay_one(
@@ -118,7 +118,7 @@ def _replay_one(
     start = reader.start
     used = recorded_config(start, path) if config is None else config
     if start.agent not in used.ids:
-        raise RecordError(f"record {path}: of agent {start.agent}, expected one of {', '.join(map(str, used.ids))}")
+        raise LogFileError(f"record {path}: of agent {start.agent}, expected one of {', '.join(map(str, used.ids))}")
     onboard = OnboardAgent(
         used,
         start.agent,

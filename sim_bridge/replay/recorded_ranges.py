@@ -15,7 +15,7 @@ from transport.messages.uwb_body import decode_uwb
 def ranges_of_record(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:
     """The ranges of a flight record on Unix time; frames that cannot be read are counted.
 
-    A frame without a stamp of its own has the time of its arrival. Raises `RecordError` for a file that is no
+    A frame without a stamp of its own has the time of its arrival. Raises `LogFileError` for a file that is no
     flight record.
     """
     return in_order(_lines(path, counts), counts)

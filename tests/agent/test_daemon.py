@@ -18,7 +18,7 @@ import pytest
 from agent.config.reading import dump
 from agent.daemon import Daemon, Periods
 from agent.exit_codes import ExitCode
-from agent.log.estimate_log import read_record
+from agent.log.estimate_log import read_entries
 from agent.mavlink.codec import Encoder, mavlink
 from agent.outputs import ClockStepped
 from agent.watch.observers import DaemonState, Observer
@@ -118,7 +118,7 @@ async def test_a_lost_autopilot_ends_the_daemon_only_where_that_is_asked_for(
     await asyncio.wait_for(running, PATIENCE_S)
     await asyncio.gather(flight, return_exceptions=True)
     assert daemon.onboard.link_state == "lost"
-    assert len(read_record(tmp_path / "rec" / "agent_001.estimates")[1]) == daemon.core.counters["ticks"]
+    assert len(read_entries(tmp_path / "rec" / "agent_001.estimates")[1]) == daemon.core.counters["ticks"]
 
 
 async def test_a_stranger_on_the_mavlink_port_gets_none_of_the_autopilots_frames(config_of: Any) -> None:
@@ -249,7 +249,7 @@ async def test_the_record_gets_its_end_whatever_fails_before_it(
     assert "Connection timed out" in caplog.text
     summary = json.loads((tmp_path / "rec" / "agent_001.json").read_text())
     assert summary["counters"]["program faults"] >= 1
-    assert len(read_record(tmp_path / "rec" / "agent_001.estimates")[1]) > 2
+    assert len(read_entries(tmp_path / "rec" / "agent_001.estimates")[1]) > 2
 
 
 class Watching(Observer):
@@ -314,7 +314,7 @@ async def test_estimates_and_diagnostics_are_there_for_a_monitor(config_of: Any)
 
 def check_records(directory: Path) -> None:
     for agent_id in (1, 2):
-        header, entries = read_record(directory / f"agent_{agent_id:03d}.estimates")
+        header, entries = read_entries(directory / f"agent_{agent_id:03d}.estimates")
         assert (header.agent, header.agents) == (agent_id, (1, 2))
         assert (entries["tick"][1:] - entries["tick"][:-1] == 1).all()
         assert (entries["status"] == Status.OK).any()

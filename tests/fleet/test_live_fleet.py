@@ -16,7 +16,7 @@ import pytest
 
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import read_record
+from agent.log.estimate_log import read_entries
 from fleetloc.report.fleet_results import load_results
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from sim_bridge.world.truth import load_truth
@@ -77,7 +77,7 @@ def check_accuracy(config: FleetConfig, live: Path, lockstep: Path) -> None:
 
 def settled(config: FleetConfig, folder: Path, agent_id: int) -> tuple[np.ndarray, np.ndarray]:
     """From `SETTLED_S` on, by tick: ages ``(K, n)`` of the data, own position errors ``(K,)`` in m."""
-    header, entries = read_record(folder / f"agent_{agent_id:03d}.estimates")
+    header, entries = read_entries(folder / f"agent_{agent_id:03d}.estimates")
     truth, slot = load_truth(folder / "truth.npz"), config.ids.index(agent_id)
     unix_s = entries["t_s"] + header.epoch_unix_s
     inside = (unix_s >= truth.time_unix_s[0] + SETTLED_S) & (unix_s < truth.time_unix_s[-1])
@@ -132,14 +132,14 @@ def time_of(log: str, words: str) -> datetime:
 
 def check_ticks_without_gap(out: Path) -> None:
     for agent_id in (1, 2):
-        _, entries = read_record(out / f"agent_{agent_id:03d}.estimates")
+        _, entries = read_entries(out / f"agent_{agent_id:03d}.estimates")
         assert (np.diff(entries["tick"]) == 1).all()
 
 
 def check_taken_back(out: Path, killed_unix_s: float) -> None:
     """In the eyes of agent 2 the information of agent 3 grows old, and is fresh again soon after the restart."""
-    header, entries = read_record(out / "agent_002.estimates")
-    _, second_life = read_record(out / "agent_003.estimates")
+    header, entries = read_entries(out / "agent_002.estimates")
+    _, second_life = read_entries(out / "agent_003.estimates")
     age, unix_s = entries["age_ticks"][:, 2], entries["t_s"] + header.epoch_unix_s
     assert age[(unix_s > killed_unix_s)].max() > 5
     back_s = second_life["t_s"][0] + header.epoch_unix_s

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from pymavlink import mavutil
 
-from agent.log.estimate_log import covariance_of, read_record
+from agent.log.estimate_log import covariance_of, read_entries
 from agent.log.flight_format import CLOSED, CUT_OFF
 from estimators.factory import make_estimator
 from sim_bridge.replay.flight_log_replay import ReplayedTick, replay_flight_log
@@ -51,7 +51,7 @@ def size(path: Path) -> int:
 
 def check_covariances(path: Path, ticks: list[ReplayedTick]) -> None:
     """Against the daemon's other record, which has whole covariances."""
-    header, entries = read_record(path)
+    header, entries = read_entries(path)
     live = {int(entry["tick"]): entry for entry in entries}
     compared = 0
     for tick in ticks:

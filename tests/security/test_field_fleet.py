@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.log.estimate_log import read_record
+from agent.log.estimate_log import read_entries
 from agent.log.tlog import read_frames
 from agent.mavlink.signing import SIGNED
 from fleetloc import cli
@@ -40,7 +40,7 @@ def test_a_field_fleet_of_three_flies_and_agrees(tmp_path: Path) -> None:
         assert agent["sensors"]["range"]["used"] > 30
     last = []
     for agent_id in (1, 2, 3):
-        _, entries = read_record(fleet.out / f"agent_{agent_id:03d}.estimates")
+        _, entries = read_entries(fleet.out / f"agent_{agent_id:03d}.estimates")
         assert (np.diff(entries["tick"]) == 1).all()
         assert len(entries) >= 50  # whether on time is for a machine that does nothing else
         last.append({int(entry["tick"]): entry["mean"] for entry in entries})

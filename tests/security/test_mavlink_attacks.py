@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.config.reading import load_config
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.inputs import MavlinkIn
 from agent.mavlink.codec import Decoder, Encoder, Message, mavlink
 from agent.mavlink.session import LinkState
@@ -167,7 +167,7 @@ def test_stamps_that_cannot_be_read_or_written_are_named(tmp_path: Path) -> None
     file.path.chmod(0o644)
     with pytest.raises(KeyFileError, match="chmod 600"):
         file.load()
-    with pytest.raises(RecordError, match="cannot be written"):
+    with pytest.raises(LogFileError, match="cannot be written"):
         StampFile(tmp_path / "nowhere" / "x.stamps").save(LinkSigning(KEY, unix_s=NOW_S).stamps)
 
 

@@ -12,8 +12,8 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.log.disk import DiskLimit
+from agent.log.estimate_mcap import agent_key
 from agent.log.flight_log import FlightLog
-from agent.log.mcap_record import agent_key
 from agent.log.run_logs import flight_start
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady

@@ -7,19 +7,19 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.log.estimate_log import (
-    EstimateRecorder,
-    RecordHeader,
+    EstimateLogHeader,
+    EstimateLogWriter,
     covariance_of,
     entry_dtype,
-    read_record,
+    read_entries,
     write_summary,
 )
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, Status
 
-HEADER = RecordHeader(fleet="test", agent=1, agents=(1, 2), period_s=0.1, epoch_unix_s=5.0)
+HEADER = EstimateLogHeader(fleet="test", agent=1, agents=(1, 2), period_s=0.1, epoch_unix_s=5.0)
 
 
 def ready(tick: int, seed: int = 0) -> EstimateReady:
@@ -31,11 +31,11 @@ def ready(tick: int, seed: int = 0) -> EstimateReady:
 
 def test_a_record_is_read_back_as_it_was_written(tmp_path: Path) -> None:
     path = tmp_path / "new" / "agent_001.estimates"
-    recorder = EstimateRecorder(path, HEADER, 10**6)
+    recorder = EstimateLogWriter(path, HEADER, 10**6)
     for tick in range(20):
         recorder.write(ready(tick, tick), 0.1 * tick + 0.13, 0.002)
     recorder.close()
-    header, entries = read_record(path)
+    header, entries = read_entries(path)
     assert header == HEADER
     assert entries["tick"].tolist() == list(range(20))
     assert entries["published_s"] == pytest.approx(0.1 * np.arange(20) + 0.13)
@@ -46,25 +46,25 @@ def test_a_record_is_read_back_as_it_was_written(tmp_path: Path) -> None:
 
 
 def test_an_estimate_out_more_than_a_period_after_its_tick_is_late(tmp_path: Path) -> None:
-    recorder = EstimateRecorder(tmp_path / "a.estimates", HEADER, 10**6)
+    recorder = EstimateLogWriter(tmp_path / "a.estimates", HEADER, 10**6)
     for published_s in (1.19, 1.21):
         recorder.write(ready(10), published_s, 0.0)
     recorder.close()
-    assert read_record(recorder.path)[1]["on_time"].tolist() == [True, False]
+    assert read_entries(recorder.path)[1]["on_time"].tolist() == [True, False]
 
 
 def test_a_killed_writer_leaves_whole_entries(tmp_path: Path) -> None:
     path = tmp_path / "agent_001.estimates"
-    recorder = EstimateRecorder(path, HEADER, 10**6)
+    recorder = EstimateLogWriter(path, HEADER, 10**6)
     recorder.write(ready(1), 0.0, 0.0)
     recorder.write(ready(2), 0.0, 0.0)
     recorder.close()
     path.write_bytes(path.read_bytes()[:-5])
-    assert read_record(path)[1]["tick"].tolist() == [1]
+    assert read_entries(path)[1]["tick"].tolist() == [1]
 
 
 def test_a_full_record_stops_growing_and_says_so(tmp_path: Path) -> None:
-    recorder = EstimateRecorder(tmp_path / "a.estimates", HEADER, 3 * entry_dtype(2).itemsize)
+    recorder = EstimateLogWriter(tmp_path / "a.estimates", HEADER, 3 * entry_dtype(2).itemsize)
     for tick in range(5):
         recorder.write(ready(tick), 0.0, 0.0)
     recorder.close()
@@ -75,12 +75,12 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
     for content in (b"", b"not json\n", b'{"format":"other/1"}\n'):
         path = tmp_path / "wrong.estimates"
         path.write_bytes(content)
-        with pytest.raises(RecordError, match=r"wrong.estimates: expected"):
-            read_record(path)
-    with pytest.raises(RecordError, match="cannot be read"):
-        read_record(tmp_path / "missing")
+        with pytest.raises(LogFileError, match=r"wrong.estimates: expected"):
+            read_entries(path)
+    with pytest.raises(LogFileError, match="cannot be read"):
+        read_entries(tmp_path / "missing")
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match="cannot be written"):
-        EstimateRecorder(tmp_path / "file" / "a.estimates", HEADER, 10**6)
-    with pytest.raises(RecordError, match="cannot be written"):
+    with pytest.raises(LogFileError, match="cannot be written"):
+        EstimateLogWriter(tmp_path / "file" / "a.estimates", HEADER, 10**6)
+    with pytest.raises(LogFileError, match="cannot be written"):
         write_summary(tmp_path / "file" / "a.json", {})

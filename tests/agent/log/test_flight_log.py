@@ -17,14 +17,14 @@ from nacl.signing import SigningKey
 
 from agent.config.reading import config_from, dump
 from agent.config.tables import FleetConfig
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.inputs import Due, Gone, HouseKept, Input, MavlinkIn, PacketIn, Served, UwbIn
 from agent.log import flight_log
 from agent.log.disk import DiskLimit
+from agent.log.estimate_mcap import CHUNK_BYTES, EstimateMcap, EstimateMessage
 from agent.log.flight_format import CLOSED, CUT_OFF, trust_from, trust_text
 from agent.log.flight_log import FlightLog
 from agent.log.flight_reader import FlightReader, RecordedEntry, RecordedInput
-from agent.log.mcap_record import CHUNK_BYTES, EstimateMcap, EstimateMessage
 from agent.log.run_logs import flight_start
 from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.outputs import EstimateReady
@@ -121,7 +121,7 @@ def test_public_keys_go_in_and_come_out_and_nothing_secret_does(tmp_path: Path, 
     assert trust_from(trust_text(UNSIGNED)) is UNSIGNED
     texts = "".join(start.texts().values())
     assert not any(key.encode().hex() in texts for key in keys.values())
-    with pytest.raises(RecordError, match="public keys: expected"):
+    with pytest.raises(LogFileError, match="public keys: expected"):
         trust_from("{]")
 
 
@@ -210,7 +210,7 @@ def test_a_record_cut_off_at_any_byte_gives_its_beginning(
     path.write_bytes(content[: int(share * len(content))])
     try:
         inputs, _, ended = read(directory / "agent_001.mcap")
-    except RecordError:  # not even its begin is left
+    except LogFileError:  # not even its begin is left
         assert suffix == ".mcap"
         inputs, ended = [], CUT_OFF
     assert inputs == written[: len(inputs)]
@@ -232,7 +232,7 @@ def test_a_flipped_bit_in_the_mcap_is_noticed_or_harmless(
     shutil.copy(source / "agent_001.tlog", directory)
     try:
         inputs, _, _ = read(directory / "agent_001.mcap")
-    except RecordError:
+    except LogFileError:
         inputs = []
     assert inputs == written[: len(inputs)]
     shutil.rmtree(directory)
@@ -240,25 +240,25 @@ def test_a_flipped_bit_in_the_mcap_is_noticed_or_harmless(
 
 def test_what_is_no_flight_record_is_refused_in_one_line(tmp_path: Path, config: FleetConfig) -> None:
     path = tmp_path / "a.mcap"
-    with pytest.raises(RecordError, match=r"a\.mcap: cannot be read"):
+    with pytest.raises(LogFileError, match=r"a\.mcap: cannot be read"):
         FlightReader(path)
     for content in (b"", b"text\n" * 100):
         path.write_bytes(content)
-        with pytest.raises(RecordError, match=r"a\.mcap: expected a flight record \(MCAP\)"):
+        with pytest.raises(LogFileError, match=r"a\.mcap: expected a flight record \(MCAP\)"):
             FlightReader(path)
     EstimateMcap(path, config.ids, 0.1, 0.0).close()
-    with pytest.raises(RecordError, match=r"found MCAP without metadata 'fleetloc\.start'"):
+    with pytest.raises(LogFileError, match=r"found MCAP without metadata 'fleetloc\.start'"):
         FlightReader(path)
     record = make_record(tmp_path, config)
     record.close()
     (tmp_path / "agent_001.tlog").unlink()
-    with pytest.raises(RecordError, match=r"agent_001\.mcap: cannot be read: .*agent_001\.tlog: No such file"):
+    with pytest.raises(LogFileError, match=r"agent_001\.mcap: cannot be read: .*agent_001\.tlog: No such file"):
         list(FlightReader(tmp_path / "agent_001.mcap"))
 
 
 def test_a_record_that_cannot_be_made_is_an_error_at_once(tmp_path: Path, config: FleetConfig) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match="cannot be written"):
+    with pytest.raises(LogFileError, match="cannot be written"):
         make_record(tmp_path / "file", config)
 
 

@@ -12,7 +12,7 @@ import pytest
 from agent.config.observer_tables import LogTable
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig
-from agent.errors import ConfigError, RecordError
+from agent.errors import ConfigError, LogFileError
 from agent.exit_codes import ExitCode
 from agent.mavlink.adsb import AdsbReporter
 from agent.watch.health import Health, State
@@ -198,5 +198,5 @@ def test_the_log_goes_to_the_file_of_its_agent(tmp_path: Path) -> None:
 
 def test_a_log_that_cannot_be_written_is_named(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match=r"log .*agent_003\.log: cannot be written"):
+    with pytest.raises(LogFileError, match=r"log .*agent_003\.log: cannot be written"):
         log_file(LogTable(directory=str(tmp_path / "file")), 3)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 import fleetloc
-from agent.log.estimate_log import covariance_of, read_record
+from agent.log.estimate_log import covariance_of, read_entries
 from fleetloc import cli
 
 ROOT = Path(__file__).parents[3]
@@ -29,7 +29,7 @@ def flown(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def test_an_estimate_log_is_what_the_file_holds(flown: Path) -> None:
     path = flown / "out/line3/agent_002.estimates"
-    log, (header, entries) = fleetloc.read_estimate_log(path), read_record(path)
+    log, (header, entries) = fleetloc.read_estimate_log(path), read_entries(path)
     count = len(entries)
     assert count >= 45
     assert (log.agent_id, log.agents, log.period_s) == (2, header.agents, header.period_s)
@@ -75,7 +75,7 @@ def test_the_estimates_of_a_flight_record_come_in_order() -> None:
 def test_another_file_is_refused_by_name(read: object, name: str, tmp_path: Path) -> None:
     path = tmp_path / name
     path.write_bytes(b"something else\n")
-    with pytest.raises(fleetloc.RecordError, match=re.escape(str(path))):
+    with pytest.raises(fleetloc.LogFileError, match=re.escape(str(path))):
         read(path)  # type: ignore[operator]
 
 

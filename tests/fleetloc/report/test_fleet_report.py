@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from agent.config.reading import load_config
-from agent.log.estimate_log import EstimateRecorder, RecordHeader
+from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, SolverReport, Status
 from fleetloc import cli
@@ -54,7 +54,7 @@ def make_run(directory: Path) -> Any:
         for part in parts:
             run_files.keep_earlier_record(directory, agent_id)
             path = run_files.record_path(directory, agent_id)
-            recorder = EstimateRecorder(path, RecordHeader(agent=agent_id, **header), 10**8)
+            recorder = EstimateLogWriter(path, EstimateLogHeader(agent=agent_id, **header), 10**8)
             for k in part:
                 tick = FIRST_TICK + k
                 blind = agent_id == 1 and k < 10

@@ -19,7 +19,7 @@ from nacl.signing import SigningKey
 
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.log.disk import DiskLimit
 from agent.log.flight_format import CLOSED, CUT_OFF
 from agent.outputs import EstimateReady
@@ -189,7 +189,7 @@ def test_a_run_is_equal_only_if_status_and_ages_are_too(
 
 def test_a_configuration_without_the_agent_is_refused(flown: RecordedFleet) -> None:
     config = msgspec.structs.replace(flown.config, agents=flown.config.agents[:2])
-    with pytest.raises(RecordError, match=r"agent_003\.mcap: of agent 3, expected one of 1, 2"):
+    with pytest.raises(LogFileError, match=r"agent_003\.mcap: of agent 3, expected one of 1, 2"):
         repeat(flown, 3, config)
 
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from mcap.reader import make_reader
 
-from agent.errors import RecordError
-from agent.log.mcap_record import EstimateMcap, EstimateMessage, estimate_message
+from agent.errors import LogFileError
+from agent.log.estimate_mcap import EstimateMcap, EstimateMessage, estimate_message
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, SolverReport, Status
 from transport.messages.estimate_body import MAX_AGE_TICKS
@@ -87,5 +87,5 @@ def test_what_is_read_is_what_was_estimated_bit_by_bit(values: list[float]) -> N
 
 def test_a_file_that_cannot_be_written_is_one_clear_error(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
-    with pytest.raises(RecordError, match=r"record .*a\.mcap: cannot be written: "):
+    with pytest.raises(LogFileError, match=r"record .*a\.mcap: cannot be written: "):
         EstimateMcap(tmp_path / "file" / "a.mcap", AGENTS, PERIOD_S, EPOCH_UNIX_S)

@@ -20,7 +20,7 @@ import numpy as np
 from mcap.well_known import MessageEncoding, SchemaEncoding
 from mcap.writer import Writer
 
-from agent.errors import RecordError
+from agent.errors import LogFileError
 from agent.outputs import EstimateReady
 from estimators.model.layout import STATES_PER_AGENT
 from transport.messages.estimate_body import MAX_AGE_TICKS
@@ -187,7 +187,7 @@ class EstimateMcap:
     """An MCAP file of estimates alone, of one agent or of several."""
 
     def __init__(self, path: Path, agents: tuple[int, ...], period_s: float, epoch_unix_s: float) -> None:
-        """Make the file anew; raises `RecordError` if that cannot be done.
+        """Make the file anew; raises `LogFileError` if that cannot be done.
 
         ``agents`` in the order of the blocks of the state, ``epoch_unix_s`` Unix time of fleet time zero.
         """
@@ -200,22 +200,22 @@ class EstimateMcap:
         self._channels = EstimateChannels(self._file, agents, period_s, epoch_unix_s)
 
     def write(self, agent_id: int, ready: EstimateReady, published_s: float) -> None:
-        """Append what an agent estimated; ``published_s`` fleet time. Raises `RecordError`."""
+        """Append what an agent estimated; ``published_s`` fleet time. Raises `LogFileError`."""
         try:
             self._channels.write(agent_id, ready, published_s)
         except OSError as error:
             raise _unwritable(self.path, error) from error
 
     def close(self) -> None:
-        """Write the index and close the file; raises `RecordError`."""
+        """Write the index and close the file; raises `LogFileError`."""
         try:
             self._file.close()
         except OSError as error:
             raise _unwritable(self.path, error) from error
 
 
-def _unwritable(path: Path, error: OSError) -> RecordError:
-    return RecordError(f"record {path}: cannot be written: {error.strerror or error}")
+def _unwritable(path: Path, error: OSError) -> LogFileError:
+    return LogFileError(f"record {path}: cannot be written: {error.strerror or error}")
 
 
 # --- schemas -------------------------------------------------------------------------------------------------

@@ -15,7 +15,7 @@ from typing import Literal
 from agent.config.tables import SensorsTable
 from agent.sensing.samples import GpsSample, LatencyPrior
 from agent.sensing.timeline import TickInput
-from estimators.calibration.latency import AccelerationHistory, Fix, LatencyEstimator, Outcome
+from estimators.calibration.latency import AccelerationHistory, FixOutcome, LatencyEstimator, TimedFix
 from estimators.integrity.latency_doubt import FixTiming
 
 Stamp = Literal["boot", "utc", "arrival"]
@@ -63,7 +63,7 @@ class _Source:
     """One kind of fix: what is known of its latency, and fixes that wait for the acceleration of their time."""
 
     estimator: LatencyEstimator
-    waiting: deque[Fix] = field(default_factory=lambda: deque(maxlen=MAX_WAITING))
+    waiting: deque[TimedFix] = field(default_factory=lambda: deque(maxlen=MAX_WAITING))
 
 
 class GpsLatency:
@@ -125,11 +125,11 @@ class GpsLatency:
         refused = False
         for source in self._sources.values():
             while source.waiting and source.estimator.ready(source.waiting[0].stamp_s):
-                refused |= self._estimate(source.estimator, source.waiting.popleft()) is Outcome.REJECTED
+                refused |= self._estimate(source.estimator, source.waiting.popleft()) is FixOutcome.REJECTED
         if self.timing is not None:
             self.timing = replace(self.timing, refused=refused)
 
-    def _estimate(self, estimator: LatencyEstimator, fix: Fix) -> Outcome | None:
+    def _estimate(self, estimator: LatencyEstimator, fix: TimedFix) -> FixOutcome | None:
         try:
             outcome = estimator.update(fix)
         except ValueError:  # not finite, or out of order
@@ -154,7 +154,7 @@ class GpsLatency:
         return 0.0 if source is None else math.hypot(*source.estimator.velocity_mps)
 
 
-def _fix(sample: GpsSample) -> Fix:
+def _fix(sample: GpsSample) -> TimedFix:
     north, east, _ = sample.position_m
     variances = sample.horizontal_sigma_m**2, sample.speed_sigma_mps**2
-    return Fix(sample.t_s, (north, east), variances[0], sample.ground_velocity_mps, variances[1])
+    return TimedFix(sample.t_s, (north, east), variances[0], sample.ground_velocity_mps, variances[1])

@@ -79,7 +79,7 @@ class LatencyModel:
     memory_s: float = 3600.0
 
 
-class Outcome(Enum):
+class FixOutcome(Enum):
     """What became of a fix; of two that hold, the later one is told."""
 
     STARTED = auto()
@@ -93,7 +93,7 @@ class Outcome(Enum):
 
 
 @dataclass(frozen=True, slots=True)
-class Fix:
+class TimedFix:
     """A fix: position (m) and, if measured, velocity (m/s), north and east, with the variance per axis."""
 
     stamp_s: float
@@ -208,7 +208,7 @@ class LatencyEstimator:
         north, east = self._weights @ self.means[:, V]
         return float(north), float(east)
 
-    def update(self, fix: Fix) -> Outcome:
+    def update(self, fix: TimedFix) -> FixOutcome:
         """Take in a fix; fixes come in the order of their stamps.
 
         Raises `ValueError`, and changes nothing, if anything is not finite, a variance not positive or the order
@@ -216,15 +216,15 @@ class LatencyEstimator:
         """
         self._check(fix)
         if not self._covered(fix.stamp_s, fix.stamp_s):
-            return Outcome.UNCOVERED
+            return FixOutcome.UNCOVERED
         last_s = self._stamp_s
         self._stamp_s = fix.stamp_s
         if last_s is None:
             self._start(fix)
-            return Outcome.STARTED
+            return FixOutcome.STARTED
         if fix.stamp_s - last_s > LOST_AFTER_S or not self._covered(last_s, fix.stamp_s):
             self._start(fix)
-            return Outcome.RESTARTED
+            return FixOutcome.RESTARTED
         self._propagate(last_s, fix)
         self._share = self._manoeuvre(fix.stamp_s - self.latency_s)
         outcomes = [self._measure("position", P, fix.position_m, fix.position_variance_m2)]
@@ -236,7 +236,7 @@ class LatencyEstimator:
     def _covered(self, from_stamp_s: float, to_stamp_s: float) -> bool:
         return self.history.covers(from_stamp_s - self.grid_s[-1] - HALF_S, to_stamp_s - self.grid_s[0] + HALF_S)
 
-    def _start(self, fix: Fix) -> None:
+    def _start(self, fix: TimedFix) -> None:
         """Everything but the weights anew, from a fix alone."""
         self.means[:] = 0.0
         self.covariance[:] = np.diag((0.0, 0.0, 0.0, 0.0, *self._stationary))
@@ -253,7 +253,7 @@ class LatencyEstimator:
         self.covariance[:, part] = 0.0
         self.covariance[part, part] = variance * np.eye(2)
 
-    def _propagate(self, last_s: float, fix: Fix) -> None:
+    def _propagate(self, last_s: float, fix: TimedFix) -> None:
         """Move each filter on from the last fix's instant to this one's, as it believes them to be."""
         duration_s = fix.stamp_s - last_s
         gained, moved = self.history.integrals(last_s - self.grid_s, fix.stamp_s - self.grid_s)
@@ -279,19 +279,19 @@ class LatencyEstimator:
         variance += self._model.bias_sigma_mps2**2
         return max(0.0, 1.0 - STANDS_OUT * variance / max(squared, variance))
 
-    def _measure(self, name: str, part: slice, value: Pair, variance: float) -> Outcome:
+    def _measure(self, name: str, part: slice, value: Pair, variance: float) -> FixOutcome:
         """Gated update of all filters with two components of the state; the gate is for their weighted mean."""
         squares = np.empty(GRID_POINTS)
         if not update_bank(self.means, self.covariance, self._weights, part.start, *value, variance, squares):
             self._rejected[name] += 1
             if self._rejected[name] < REJECTED_IN_A_ROW:
-                return Outcome.REJECTED
+                return FixOutcome.REJECTED
             self._rejected[name] = 0
             self._renew(part, value, variance)
-            return Outcome.RESTARTED
+            return FixOutcome.RESTARTED
         self._rejected[name] = 0
         self._log_likelihood -= 0.5 * self._share * squares
-        return Outcome.USED
+        return FixOutcome.USED
 
     def _weigh(self) -> None:
         """Weights, mean and spread of the latency from the likelihoods and the prior."""
@@ -308,7 +308,7 @@ class LatencyEstimator:
         self.sigma_s = self._spread * sigma
         """1-sigma of ``latency_s``."""
 
-    def _check(self, fix: Fix) -> None:
+    def _check(self, fix: TimedFix) -> None:
         values = (fix.stamp_s, *fix.position_m, *(fix.velocity_mps or ()))
         variances = (fix.position_variance_m2, fix.velocity_variance_m2ps2)
         if not all(map(math.isfinite, (*values, *variances))) or min(variances) <= 0.0:

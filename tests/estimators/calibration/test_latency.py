@@ -11,7 +11,7 @@ from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 from scipy.integrate import cumulative_trapezoid
 
-from estimators.calibration.latency import AccelerationHistory, Fix, LatencyEstimator, LatencyModel, Outcome
+from estimators.calibration.latency import AccelerationHistory, FixOutcome, LatencyEstimator, LatencyModel, TimedFix
 from tests.support.manoeuvres import Course, Markov
 
 TICK_S = 0.1
@@ -88,7 +88,7 @@ def fly(
             of_s = stamp_s - errors.latency_s
             p = course.position(of_s) + wander.step() + errors.white_m * rng.standard_normal(2)
             v = course.velocity(of_s) + errors.velocity_mps * rng.standard_normal(2)
-            fix = Fix(
+            fix = TimedFix(
                 stamp_s,
                 (float(p[0]), float(p[1])),
                 (errors.reported_m or errors.white_m) ** 2,
@@ -179,9 +179,9 @@ def test_an_outlier_is_left_out_and_a_jump_is_followed() -> None:
     before_s, sigma_s = made.latency_s, made.sigma_s
     hold(made, 30.0, 20)
     # WHEN fixes are 3 km off
-    outcomes = [made.update(Fix(stamp_s + 0.1 * k, (3000.0, 0.0), 1.0, None, 1.0)) for k in range(6)]
+    outcomes = [made.update(TimedFix(stamp_s + 0.1 * k, (3000.0, 0.0), 1.0, None, 1.0)) for k in range(6)]
     # THEN four are outliers, the fifth is the new truth, and nothing of it is latency
-    assert outcomes == [Outcome.REJECTED] * 4 + [Outcome.RESTARTED, Outcome.USED]
+    assert outcomes == [FixOutcome.REJECTED] * 4 + [FixOutcome.RESTARTED, FixOutcome.USED]
     assert made.means[:, 0] == pytest.approx(3000.0, abs=3.0)
     assert made.latency_s == pytest.approx(before_s, abs=0.01)
     assert made.sigma_s == pytest.approx(sigma_s, rel=0.1)
@@ -191,7 +191,7 @@ def test_after_a_gap_the_motion_starts_anew_and_the_latency_is_kept() -> None:
     made, _ = learned()
     before = made.latency_s, made.sigma_s
     hold(made, 500.0, 20)
-    assert made.update(Fix(501.2, (900.0, 0.0), 1.0, (1.0, 2.0), 0.1)) is Outcome.RESTARTED
+    assert made.update(TimedFix(501.2, (900.0, 0.0), 1.0, (1.0, 2.0), 0.1)) is FixOutcome.RESTARTED
     assert made.velocity_mps == pytest.approx((1.0, 2.0))
     assert (made.latency_s, made.sigma_s) == before
 
@@ -200,9 +200,9 @@ def test_a_fix_whose_time_is_not_known_is_left_out() -> None:
     made, stamp_s = learned()
     before = made.latency_s, made.sigma_s
     assert not made.ready(stamp_s + 1.0)
-    assert made.update(Fix(stamp_s + 1.0, (0.0, 0.0), 1.0, None, 1.0)) is Outcome.UNCOVERED
+    assert made.update(TimedFix(stamp_s + 1.0, (0.0, 0.0), 1.0, None, 1.0)) is FixOutcome.UNCOVERED
     assert (made.latency_s, made.sigma_s) == before
-    assert made.update(Fix(stamp_s, (0.0, 0.0), 1.0, None, 1.0)) is not Outcome.UNCOVERED
+    assert made.update(TimedFix(stamp_s, (0.0, 0.0), 1.0, None, 1.0)) is not FixOutcome.UNCOVERED
 
 
 def test_in_steady_flight_it_forgets_slowly() -> None:
@@ -217,7 +217,7 @@ def test_in_steady_flight_it_forgets_slowly() -> None:
         for one in (made, forgetful):
             one.history.add(time_s, time_s + TICK_S, (float(north), float(east)), 0.0025)
             if k > 10:
-                one.update(Fix(time_s - 0.5, (float(position[0]), float(position[1])), 0.01, None, 1.0))
+                one.update(TimedFix(time_s - 0.5, (float(position[0]), float(position[1])), 0.01, None, 1.0))
     assert made.sigma_s < 0.035
     assert made.sigma_s < forgetful.sigma_s == pytest.approx(0.04, rel=0.05)
 
@@ -226,7 +226,7 @@ def test_in_steady_flight_it_forgets_slowly() -> None:
 def test_what_is_not_finite_is_refused_and_changes_nothing(wrong: float) -> None:
     made, stamp_s = learned()
     means, covariance, known = made.means.copy(), made.covariance.copy(), (made.latency_s, made.sigma_s)
-    good = Fix(stamp_s, (0.0, 0.0), 1.0, (0.0, 0.0), 1.0)
+    good = TimedFix(stamp_s, (0.0, 0.0), 1.0, (0.0, 0.0), 1.0)
     for fix in (
         replace(good, position_m=(wrong, 0.0)),
         replace(good, velocity_mps=(0.0, wrong)),
@@ -292,7 +292,7 @@ def test_whatever_comes_it_stays_finite_and_within_its_grid(steps: list[tuple]) 
         for _ in range(math.ceil(wait_s / TICK_S)):
             made.history.add(time_s, time_s + TICK_S, accel, 0.01)
             time_s += TICK_S
-        made.update(Fix(time_s - 0.4, position, variance, velocity, variance))
+        made.update(TimedFix(time_s - 0.4, position, variance, velocity, variance))
         assert np.isfinite(made.means).all()
         eigenvalues = np.linalg.eigvalsh(made.covariance)
         assert eigenvalues[0] >= -1e-9 * eigenvalues[-1]

@@ -103,10 +103,10 @@ def read_truth(path: str | Path) -> Truth:
     return load_truth(Path(path))
 
 
-def replay_flight_log(path: str | Path, config: FleetConfig | None = None) -> record_replay.FlightLogReplay:
+def replay_flight_log(path: str | Path, config: FleetConfig | None = None) -> flight_log_replay.FlightLogReplay:
     """Repeat a flight record (``agent_001.mcap`` with its .tlog beside it) and compare with what was estimated.
 
     Without ``config`` it runs with the configuration it was flown with. Raises `LogFileError`.
     """
-    (result,) = record_replay.replay_flight_log([Path(path)], config, make_estimator)
+    (result,) = flight_log_replay.replay_flight_log([Path(path)], config, make_estimator)
     return result

@@ -5,7 +5,7 @@
 ``truth.npz``                  where every drone truly was (`sim_bridge.truth`)
 ``agent_001.estimates``        the last record of agent 1 (`agent.recording`)
 ``agent_001.1.estimates``      the record before it, if the daemon was restarted; ``.2`` the next, ...
-``agent_001.mcap``, ``.tlog``  the flight record of its last daemon (`agent.flight_record`), likewise
+``agent_001.mcap``, ``.tlog``  the flight log of its last daemon (`agent.log.flight_log`), likewise
 ``agent_001.json``             counters of its last daemon, likewise
 ``agent_001.log``              what the daemon said on stderr
 ``simulator.log``              what the simulator said

@@ -338,7 +338,7 @@ def test_a_disk_too_slow_ends_the_record_instead_of_filling_the_memory(
     tmp_path: Path, config: FleetConfig, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # GIVEN a disk that does not answer
-    monkeypatch.setattr(flight_record, "MAX_WAITING_BATCHES", 10)
+    monkeypatch.setattr(flight_log, "MAX_WAITING_BATCHES", 10)
     answers = threading.Event()
 
     def free(_directory: Path) -> int:
@@ -360,7 +360,7 @@ def test_a_disk_too_slow_ends_the_record_instead_of_filling_the_memory(
 
 @pytest.fixture
 def no_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(flight_record, "CLOSE_TIMEOUT_S", 0.01)
+    monkeypatch.setattr(flight_log, "CLOSE_TIMEOUT_S", 0.01)
 
 
 @pytest.mark.usefixtures("no_patience")

@@ -21,7 +21,7 @@ from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
 from agent.errors import AgentError, ConfigError, LinkError, LogFileError, NoAutopilotError
 from agent.exit_codes import ExitCode
-from agent.log.run_logs import RunFiles
+from agent.log.run_logs import RunLogs
 from agent.mavlink.link import create_link
 from agent.mavlink.session import LinkState
 from agent.mavlink.signing_stamps import StampKeeper
@@ -138,10 +138,10 @@ class Daemon:
         identity = self.radio.identity
         unix_s, host_s = time.time(), time.monotonic()
         signing = mavlink_signing(config, agent_id, base, unix_s=unix_s)
-        self._record: RunFiles | None = None
+        self._record: RunLogs | None = None
         if config.record.directory is not None:
             directory = Path(config.record.directory)
-            self._record = RunFiles(config, agent_id, directory, identity.trust, unix_s=unix_s, host_s=host_s)
+            self._record = RunLogs(config, agent_id, directory, identity.trust, unix_s=unix_s, host_s=host_s)
         self.onboard = OnboardAgent(
             config,
             agent_id,

@@ -25,7 +25,7 @@ SOFTWARE = ("fleetloc", "numpy", "numba")
 """What the last digits of an estimate depend on."""
 
 
-class RunFiles(Observer):
+class RunLogs(Observer):
     """The files ``agent_001.*`` of one run; ``flight`` is the journal of a flight record, if one is wanted."""
 
     def __init__(

@@ -73,7 +73,7 @@ SETTINGS = (
 
 
 @dataclass(frozen=True)
-class Flight:
+class TargetFlight:
     """One run: truth ``(T, 6)``, positions measured ``(T, 2, 3)``, the channel's outcomes ``(T, 2)`` and what
     it delivers ``(T, 2, 3)``."""
 
@@ -83,7 +83,7 @@ class Flight:
     received: Floats
 
 
-def fly(setting: Setting, rng: np.random.Generator) -> Flight:
+def fly(setting: Setting, rng: np.random.Generator) -> TargetFlight:
     """Draw one run. The truth begins at `START` (the filters know it only to `START_COVARIANCE`), and what the
     channel holds before the first packet is its position."""
     model = TargetModel(1.0, setting.truth_variance, POSITION_VARIANCE_M2)
@@ -103,15 +103,15 @@ def fly(setting: Setting, rng: np.random.Generator) -> Flight:
         choices = {0: held, 1: measured[k], 2: before}
         received[k] = [choices[int(outcome[k, agent])][agent] for agent in range(2)]
         before, held = measured[k], received[k]
-    return Flight(truth, measured, outcome, received)
+    return TargetFlight(truth, measured, outcome, received)
 
 
 Estimates = Iterator[tuple[Floats, Floats]]
-Method = Callable[[TargetModel, Flight], Estimates]
+Method = Callable[[TargetModel, TargetFlight], Estimates]
 
 
 def _central(conditional: bool) -> Method:
-    def run(model: TargetModel, flight: Flight) -> Estimates:
+    def run(model: TargetModel, flight: TargetFlight) -> Estimates:
         central = CentralFilter(model, ON_TIME, LATE, START, START_COVARIANCE, conditional=conditional)
         return (central.step(received) for received in flight.received)
 
@@ -131,7 +131,7 @@ def _kalman(model: TargetModel, measured: Floats) -> Estimates:
 
 
 def _stamped(use_late: bool) -> Method:
-    def run(model: TargetModel, flight: Flight) -> Estimates:
+    def run(model: TargetModel, flight: TargetFlight) -> Estimates:
         stamped = StampedFilter(model, 2, START, START_COVARIANCE, use_late=use_late)
         before = np.concatenate([flight.measured[:1], flight.measured[:-1]])
         steps = zip(flight.measured, before, flight.outcome, strict=True)
@@ -141,7 +141,7 @@ def _stamped(use_late: bool) -> Method:
 
 
 def _distributed(rule: Rule, *, feedback: bool, compensate: bool = True) -> Method:
-    def run(model: TargetModel, flight: Flight) -> Estimates:
+    def run(model: TargetModel, flight: TargetFlight) -> Estimates:
         leader = LeaderFusion(model, START, START_COVARIANCE, rule, feedback=feedback)
         follower = LocalFilter(model, START, START_COVARIANCE)
         sent: list[SentEstimate] = []

@@ -80,7 +80,7 @@ class GpsFix:
 
 
 @dataclass(frozen=True, slots=True)
-class RangeMeasurement:
+class SensedRange:
     """A range to one agent; received powers in dBm, probability of no line of sight."""
 
     target: int
@@ -97,7 +97,7 @@ class SensedRanges:
 
     observer: int
     time_s: float
-    ranges: tuple[RangeMeasurement, ...]
+    ranges: tuple[SensedRange, ...]
 
 
 def pressure_hpa(alt_msl_m: float) -> float:
@@ -188,7 +188,7 @@ class _Channel:
         }
         self._phase_rad = {agent: float(rng.uniform(0.0, 2.0 * math.pi)) for agent in ids}
 
-    def measure(self, observer: int, target: int, true_m: float, bearing_rad: float) -> RangeMeasurement:
+    def measure(self, observer: int, target: int, true_m: float, bearing_rad: float) -> SensedRange:
         """A range over the true distance; ``bearing_rad`` of the target in the observer's body frame."""
         noise, rng = self._noise, self._rngs[observer]
         uniform = noise.uniform_m * float(rng.uniform(-1.0, 1.0))
@@ -202,7 +202,7 @@ class _Channel:
         first_path_dbm = rx_dbm - float(rng.uniform(7.0, 14.0) if blocked else rng.uniform(1.0, 4.0))
         nlos = float(rng.uniform(0.5, 1.0) if blocked else rng.uniform(0.0, 0.3))
         range_m = max(true_m + error, 0.01)
-        return RangeMeasurement(target, range_m, noise.reported_sigma_m, rx_dbm, first_path_dbm, nlos)
+        return SensedRange(target, range_m, noise.reported_sigma_m, rx_dbm, first_path_dbm, nlos)
 
 
 class _Grid:
@@ -364,7 +364,7 @@ class FleetSensors:
                     sets.append(SensedRanges(observer, time_s, measured))
         return sets
 
-    def _range_all(self, slot: int, observer: int) -> list[RangeMeasurement]:
+    def _range_all(self, slot: int, observer: int) -> list[SensedRange]:
         positions = self._world.position_m
         measured = []
         for target in self._scenario.ranged_by(observer):

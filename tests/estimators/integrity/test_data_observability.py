@@ -7,10 +7,13 @@ import pytest
 
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
-from estimators.integrity.data_observability import mark_observable
+from estimators.integrity.data_observability import ObservabilityMonitor, mark_observable
+from estimators.integrity.finding import Gravity, What
 from estimators.integrity.thresholds import OBSERVABLE_SIGMA_M
+from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.layout import Layout
 from estimators.model.measurements import RowTable, empty_inputs, empty_rows, input_rows, position_rows, range_row
+from estimators.model.members import MemberChange
 from estimators.settings import EstimatorSettings
 
 RELAY = EstimatorSettings(
@@ -79,3 +82,49 @@ def test_the_worst_direction_decides_whatever_its_name() -> None:
     observable = np.zeros(2, np.bool_)
     mark_observable(covariance, observable)
     assert observable.tolist() == [False, True]
+
+
+def unobserved(monitor: ObservabilityMonitor, fixed: set[int], *, slide: bool = True) -> list[int]:
+    """Whom a window of one tick over two drones at rest does not observe; ``fixed`` have fixes in its first tick."""
+    agents = 2
+    rows = [position_rows(0, slot, PLACES[slot], np.full(3, 0.01)) for slot in sorted(fixed)]
+    state = np.concatenate([PLACES, np.zeros((5, 3))], axis=1)[:agents].ravel()
+    m = 3 * len(rows)
+    found = monitor.observe(
+        WindowEvidence(
+            rows=np.concatenate([empty_rows(), *rows]),
+            start=np.array([0, m, m]),
+            accel_variance=np.full((1, 3 * agents), 1e-4),
+            path=np.array([state, state]),
+            arrival_mean=state,
+            arrival_information=1e6 * np.eye(6 * agents),
+            slide=slide,
+            period_s=DT,
+            norm_smoothing=1e-3,
+        )
+    )
+    assert {(finding.what, finding.gravity) for finding in found} <= {(What.NOT_OBSERVABLE, Gravity.ALARM)}
+    return [finding.about for finding in found if finding.about is not None]
+
+
+def test_each_slot_that_nothing_was_measured_of_is_found() -> None:
+    monitor = ObservabilityMonitor(2)
+    assert unobserved(monitor, set()) == [0, 1]
+    assert unobserved(monitor, {0}) == [1]
+    # what has left the window is remembered
+    assert unobserved(monitor, {1}) == []
+
+
+def test_a_window_that_does_not_slide_keeps_its_rows_for_the_next_look() -> None:
+    monitor = ObservabilityMonitor(2)
+    assert unobserved(monitor, {0}, slide=False) == [1]
+    assert unobserved(monitor, {1}, slide=False) == [0]
+
+
+def test_of_a_fresh_agent_the_data_say_what_its_prior_says_and_the_others_stay() -> None:
+    for sigma_m, expected in ((0.5 * OBSERVABLE_SIGMA_M, []), (2.0 * OBSERVABLE_SIGMA_M, [1])):
+        monitor = ObservabilityMonitor(2)
+        unobserved(monitor, {0, 1})
+        fresh = np.zeros(6), np.diag([sigma_m**2] * 3 + [0.01] * 3)
+        monitor.change_members(MemberChange.between(Layout((1, 2)), (1, 5), 1, {5: fresh}))
+        assert unobserved(monitor, set()) == expected

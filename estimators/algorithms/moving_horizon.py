@@ -86,8 +86,9 @@ class MovingHorizonEstimator:
         if not self.window.begun:
             return first_estimate(self.window, self.arrival)
         with_gains = self.settings.kind == "dmhe_pre_ekf"
-        problem = window_problem(self.window, self._consensus.unfused(), self.slot, self.period_s, with_gains)
-        solution = solve_window(problem, self.settings, budget)
+        prior, pairs = self._consensus.unfused()
+        problem = window_problem(self.window, prior, self.slot, self.period_s, with_gains)
+        solution = solve_window(problem, self.settings, budget, pairs)
         self.arrival = smoothed_arrival(problem, solution, slide=self.window.full)
         self._rank.keep(solution.path)
         _, covariance = pre_estimation(problem, self.settings.norm_smoothing_m)

@@ -18,7 +18,6 @@ from dataclasses import replace
 import numpy as np
 
 from estimators.algorithms.shared_monitors import Belief, SharedMonitors
-from estimators.consensus.information import NO_PAIRS
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.ambiguity import Body, body_of
@@ -97,12 +96,11 @@ class SharedMovingHorizonEstimator:
         if not self.window.begun:
             return first_estimate(self.window, self.arrival)
         slide, eps = self.window.full, self.settings.norm_smoothing_m
-        problem = window_problem(self.window, (self._consensus.pair(), NO_PAIRS), self.slot, self.period_s, False)
+        problem = window_problem(self.window, self._consensus.pair(), self.slot, self.period_s, False)
         solution = solve_window(problem, self.settings, budget)
         filtered = filtered_arrival(problem, solution.path, eps, slide=slide)
-        measured, problem.rows = problem.rows, filtered.rows
         belief = Belief(solution.path, filtered.covariance, filtered.arrival)
-        verdict = self._monitors.look(problem, measured, belief, slide=slide)
+        verdict = self._monitors.look(problem._replace(rows=filtered.rows), problem.rows, belief, slide=slide)
         self.arrival = verdict.belief.arrival
         return Estimate(
             self.window.last,

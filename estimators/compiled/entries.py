@@ -11,6 +11,22 @@ loaded from the cache (`estimators.compiled.cache`) by every later process::
     @entry("float64(ROW[::1], float64[:, ::1])", ROW=ROW)
     def step(rows: RowTable, out: Matrix) -> float: ...
 
+What belongs together travels as one `NamedTuple` of arrays and numbers, whose `structure` stands beside it. An
+entry takes it as the `plain` tuple, since numba would read the names of its fields anew at every call (2 us)::
+
+    class Window(NamedTuple):
+        rows: RowTable
+        dt: float
+
+    WINDOW = structure(Window, "ROW[::1], float64", ROW=ROW)
+
+    @entry("float64(WINDOW)", WINDOW=WINDOW)
+    def cost(window: Window) -> float:
+        window = Window(*window)
+        ...
+
+    cost(plain(window))
+
 Nothing is compiled by an import. The first call of an entry loads or compiles it; `warm_up` does so for all
 of them, with progress. All kernels release the interpreter lock, follow IEEE 754 to the letter (no
 ``fastmath``), and divide as numpy does (no exception).
@@ -24,7 +40,7 @@ from __future__ import annotations
 import importlib
 import os
 import pkgutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Literal, TypeVar, cast
@@ -41,6 +57,7 @@ _CONFIG: Any = numba.config
 
 What = Literal["compiling", "inner", "compiled", "ready", "waiting", "warning"]
 Function = TypeVar("Function", bound=Callable[..., Any])
+Structure = TypeVar("Structure", bound=tuple[Any, ...])
 
 OPTIONS: dict[str, Any] = {"nopython": True, "nogil": True, "error_model": "numpy", "fastmath": False}
 
@@ -132,31 +149,55 @@ def kernel(function: Function) -> Function:
     return cast(Function, numba.jit(**OPTIONS)(function))
 
 
-def entry(signature: str, **records: np.dtype[Any]) -> Callable[[Function], Function]:
+def structure(made: type[Any], fields: str, **named: Any) -> Any:
+    """What stands in an entry's signature for a `NamedTuple` of a module, as argument or as result.
+
+    ``fields`` are the types of its fields in order, in numba's notation; ``named`` as in `entry`.
+    """
+    named_tuple: Any = types.NamedTuple
+    return named_tuple(_read(f"({fields},)", named), made)
+
+
+def plain(made: Structure) -> Structure:
+    """A `NamedTuple` as the plain tuple that an entry takes; for type checkers it is what it was."""
+    return cast(Structure, tuple(made))
+
+
+def _read(notation: str, named: Mapping[str, Any]) -> Any:
+    """A type, tuple of types or signature from numba's notation and the names in it."""
+    known = {name: numba.from_dtype(each) if isinstance(each, np.dtype) else each for name, each in named.items()}
+    return eval(notation, {"__builtins__": {}}, {**vars(types), **known})
+
+
+def entry(signature: str, **named: Any) -> Callable[[Function], Function]:
     """Make a function callable from Python as machine code with exactly this signature.
 
     Parameters
     ----------
     signature
         numba's notation, e.g. ``"void(float64[:, ::1], int64)"``. ``[::1]`` takes contiguous arrays only.
-    records
-        Names of structured dtypes in the signature.
+    named
+        What the names in the signature stand for: structured dtypes, or what `structure` gives.
 
     A call with other types raises ``TypeError`` (numbers are converted). Kernels may call an entry like a
     kernel.
     """
-    named = {name: numba.from_dtype(dtype) for name, dtype in records.items()}
-
     def decorate(function: Function) -> Function:
         if _CONFIG.DISABLE_JIT:  # to debug or to measure coverage: plain Python
             return function
         remember_source(function.__module__)
-        parsed = eval(signature, {"__builtins__": {}}, {**vars(types), **named})
-        made = Entry(function, parsed)
+        parsed = _read(signature, named)
+        made = Entry(function, parsed.replace(args=tuple(_plain_type(each) for each in parsed.args)))
         _ENTRIES[_name(function)] = made
         return cast(Function, made)
 
     return decorate
+
+
+def _plain_type(argument: Any) -> Any:
+    """The type of an argument of an entry: a structure's is that of its plain tuple."""
+    made: Any = types.Tuple
+    return made(argument.types) if isinstance(argument, types.NamedTuple) else argument
 
 
 def _name(function: Any) -> str:

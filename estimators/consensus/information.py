@@ -8,7 +8,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.compiled.entries import entry, kernel
+from estimators.compiled.entries import entry, kernel, plain, structure
 from estimators.compiled.linear_algebra import factor_upper
 from estimators.estimator import Payload
 from estimators.model.measurements import Matrix, Vector
@@ -27,15 +27,15 @@ class Pairs(NamedTuple):
     """``(J, 6n)``."""
 
 
+PAIRS = structure(Pairs, "float64[::1], float64[:, :, ::1], float64[:, ::1]")
 NO_PAIRS = Pairs(np.zeros(0), np.zeros((0, 0, 0)), np.zeros((0, 0)))
 """Nothing to fuse."""
 
 
 @kernel
-def combine(
-    weights: Vector, informations: NDArray[np.float64], vectors: Matrix, information: Matrix, vector: Vector
-) -> None:
+def combine(pairs: Pairs, information: Matrix, vector: Vector) -> None:
     """information, vector <- weighted sums of the pairs: (13)-(14)."""
+    weights, informations, vectors = pairs.weights, pairs.informations, pairs.vectors
     n = vector.shape[0]
     for i in range(n):
         vector[i] = 0.0
@@ -49,12 +49,10 @@ def combine(
                 information[i, j] += weight * informations[p, i, j]
 
 
-@entry("void(float64[::1], float64[:, :, ::1], float64[:, ::1], float64[:, ::1], float64[::1])")
-def combine_pairs(
-    weights: Vector, informations: NDArray[np.float64], vectors: Matrix, information: Matrix, vector: Vector
-) -> None:
+@entry("void(PAIRS, float64[:, ::1], float64[::1])", PAIRS=PAIRS)
+def combine_pairs(pairs: Pairs, information: Matrix, vector: Vector) -> None:
     """`combine`, for Python."""
-    combine(weights, informations, vectors, information, vector)
+    combine(Pairs(*pairs), information, vector)
 
 
 @entry("boolean(float64[:, ::1])")
@@ -143,7 +141,7 @@ def weigh(
 def fuse_pairs(pairs: Pairs) -> tuple[Matrix, Vector]:
     """The convex combination (13)-(14)."""
     information, vector = np.empty(pairs.informations.shape[1:]), np.empty(pairs.vectors.shape[1])
-    combine_pairs(*pairs, information, vector)
+    combine_pairs(plain(pairs), information, vector)
     return information, vector
 
 

@@ -8,18 +8,33 @@ state box is hard. Each program carries the rows that are near their bound and i
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
+from estimators.compiled.entries import plain
 from estimators.estimator import SolverReport, Status
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Matrix, Vector
 from estimators.settings import EstimatorSettings
-from estimators.solvers.constrained_kernels import evaluate, finish, linearise_bounds, prepare
+from estimators.solvers.constrained_kernels import (
+    BoundPoint,
+    LinearProgram,
+    Prepared,
+    evaluate,
+    finish,
+    linearise_bounds,
+    prepare,
+)
 from estimators.solvers.qp import QpEngine, QuadraticProgram, make_engine, solve_exactly
-from estimators.window.kernels import CORRECTED, NOTHING, PREDICTED
-from estimators.window.types import WindowProblem, WindowSolution
+from estimators.window.problem import Window
+from estimators.window.types import (
+    CORRECTED,
+    NOTHING,
+    PREDICTED,
+    StepOptions,
+    WindowProblem,
+    WindowSolution,
+)
 
 NEAR = 0.5
 """Fraction of a bound from which on a row enters the first program."""
@@ -27,11 +42,6 @@ NEAR = 0.5
 SUFFICIENT_DECREASE = 1e-4
 ROUNDING = 1e-13
 SHORTEST_STEP = 2.0**-20
-
-# the prepared arrays are passed on as they came, which no static type can follow
-_evaluate: Any = evaluate
-_linearise: Any = linearise_bounds
-_finish_window: Any = finish
 
 
 def bound_kind(settings: EstimatorSettings, with_gains: bool) -> int:
@@ -49,6 +59,12 @@ def box(settings: EstimatorSettings) -> tuple[float, float]:
     return settings.state_box_position_m or np.inf, settings.state_box_speed_mps or np.inf
 
 
+def step_options(settings: EstimatorSettings, with_gains: bool, limit: int) -> StepOptions:
+    """The settings as the kernels take them, with at most ``limit`` iterations."""
+    bounds_on = bound_kind(settings, with_gains)
+    return StepOptions(settings.norm_smoothing_m, bounds_on, *box(settings), limit, settings.tolerance)
+
+
 def solve_constrained(
     problem: WindowProblem, settings: EstimatorSettings, limit: int, path: Matrix
 ) -> WindowSolution | None:
@@ -58,31 +74,19 @@ def solve_constrained(
 
     An agent outside the optimisation that violates the box joins it, and the step is done again: exact.
     """
+    options = step_options(settings, problem.with_gains, settings.max_iterations)
+    first_state = np.ascontiguousarray(path[0])
     keep = set(problem.keep.tolist())
     while True:
-        prepared = prepare(
-            problem.rows,
-            problem.start,
-            problem.accel,
-            problem.accel_variance,
-            problem.information,
-            problem.vector,
-            np.array(sorted(keep), np.int64),
-            problem.period_s,
-            settings.norm_smoothing_m,
-            problem.with_gains,
-            settings.max_iterations,
-            settings.tolerance,
-            np.ascontiguousarray(path[0]),
-        )
-        region, window, start = prepared[:7], prepared[7:18], prepared[18]
-        outcome = _Sqp(window, settings, make_engine(settings.qp)).run(start, limit)
+        extended = problem._replace(keep=np.array(sorted(keep), np.int64))
+        prepared = prepare(plain(extended), plain(options), first_state)
+        outcome = _Sqp(prepared.window, settings, make_engine(settings.qp)).run(prepared.z, limit)
         if outcome is None:
             return None
-        solution = _finish(problem, region, window, outcome)
+        solution = _finished(problem, prepared, outcome)
         if solution is None:
             return None
-        outside = set(region[1][: region[2]].tolist())
+        outside = set(prepared.region.order[: prepared.region.outside].tolist())
         joining = outside & _out_of_box(solution.path, settings)
         if not joining:
             return solution
@@ -106,13 +110,10 @@ class _Outcome:
     active: int
 
 
-def _finish(
-    problem: WindowProblem, region: tuple[Any, ...], window: tuple[Any, ...], outcome: _Outcome
-) -> WindowSolution | None:
+def _finished(problem: WindowProblem, prepared: Prepared, outcome: _Outcome) -> WindowSolution | None:
     n = len(problem.vector)
     path, information = np.empty((len(problem.accel) + 1, n)), np.empty((n, n))
-    arguments = (*region, *window, outcome.z, problem.rows, problem.accel, problem.accel_variance)
-    if not _finish_window(*arguments, problem.information, path, information):
+    if not finish(plain(prepared.region), plain(prepared.window), outcome.z, plain(problem), path, information):
         return None
     status = Status.OK if outcome.converged else Status.NOT_CONVERGED
     report = SolverReport(outcome.iterations, outcome.programs, outcome.cost, outcome.active)
@@ -120,13 +121,13 @@ def _finish(
 
 
 class _Sqp:
-    """One run of sequential quadratic programming; ``window`` holds the arrays of a `Window`."""
+    """One run of sequential quadratic programming."""
 
-    def __init__(self, window: tuple[Any, ...], settings: EstimatorSettings, engine: QpEngine) -> None:
-        self.window = window
+    def __init__(self, window: Window, settings: EstimatorSettings, engine: QpEngine) -> None:
+        self.window = plain(window)
         self.settings = settings
         self.engine = engine
-        data, row_start, gains, prior_mean = window[1], window[2], window[5], window[6]
+        data, row_start, gains, prior_mean = window.data, window.start, window.gains, window.prior_mean
         self.bounds_on = bound_kind(settings, len(gains) > 0)
         self.rows, self.d, self.ticks = len(data), len(prior_mean), len(row_start) - 2
         half = np.where(np.arange(self.rows) >= row_start[1], data[:, 3], np.inf)
@@ -143,7 +144,7 @@ class _Sqp:
     def values(self, z: Vector) -> tuple[float, Vector]:
         """f and all bounded quantities: residuals, then states."""
         states, residuals = np.empty((self.ticks + 1, self.d)), np.empty(self.rows)
-        f = float(_evaluate(*self.window, z, self.bounds_on, states, residuals))
+        f = evaluate(self.window, z, self.bounds_on, states, residuals)
         return f, np.concatenate([residuals, states.ravel()])
 
     def merit(self, f: float, values: Vector) -> float:
@@ -181,12 +182,11 @@ class _Sqp:
     ) -> tuple[Vector, Vector, float] | None:
         """Step, multipliers, and the decrease of the merit that the quadratic model promises."""
         n = len(z)
-        linear, inverse_root, rows = np.empty(n), np.empty((n, n)), np.empty((len(self.bound), n))
+        made = LinearProgram(np.empty(n), np.empty((n, n)), np.empty((len(self.bound), n)))
+        linear, inverse_root, rows = made
         state_multipliers = np.ascontiguousarray(multipliers[self.rows :]).reshape(self.ticks + 1, self.d)
-        if not _linearise(
-            *self.window, z, self.bounds_on, multipliers[: self.rows], state_multipliers, exact, self.boxed,
-            linear, inverse_root, rows,
-        ):  # fmt: skip
+        point = BoundPoint(z, multipliers[: self.rows], state_multipliers, self.bounds_on, self.boxed)
+        if not linearise_bounds(self.window, plain(point), exact, plain(made)):
             return None
         entered = (np.abs(values) > NEAR * self.bound) | (multipliers != 0.0)
         while True:

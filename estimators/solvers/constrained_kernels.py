@@ -1,21 +1,21 @@
-"""Compiled pieces of the constrained step; `estimators.solvers.constrained` puts them together with a QP engine.
-
-A prepared window travels between the calls as the plain arrays of `Region` and `Window`.
-"""
+"""Compiled pieces of the constrained step; `estimators.solvers.constrained` puts them together with a QP engine."""
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
-from estimators.compiled.entries import entry, kernel
+from estimators.compiled.entries import entry, kernel, structure
 from estimators.compiled.linear_algebra import factor_upper, solve_upper_transposed
 from estimators.model.layout import STATES_PER_AGENT
-from estimators.model.measurements import ROW, Matrix, RowTable, Vector
+from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import predict_sensitivity
-from estimators.model.row_kernels import IntArray, chain_gradient
+from estimators.model.row_kernels import chain_gradient
 from estimators.solvers.gauss_newton import minimise, set_weights
-from estimators.window.kernels import CORRECTED, arrival_update, write_states
+from estimators.window.kernels import arrival_update, write_states
 from estimators.window.problem import (
+    WINDOW,
     Trajectory,
     Window,
     empty_trajectory,
@@ -23,90 +23,49 @@ from estimators.window.problem import (
     hessian,
     roll_out,
 )
-from estimators.window.regional import Region, gather, regional_problem
-
-_REGION = (
-    "boolean, int64[::1], int64, float64[:, ::1], float64[::1], float64[:, ::1], float64[:, ::1]"
-)
-_WINDOW = (
-    "int64[:, ::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],"
-    " float64[::1], float64[:, ::1], float64[:, ::1], float64, float64"
-)
+from estimators.window.regional import REGION, Region, gather, regional_problem
+from estimators.window.types import CORRECTED, OPTIONS, PROBLEM, StepOptions, WindowProblem
 
 
-@entry(
-    f"Tuple(({_REGION}, {_WINDOW}, float64[::1], boolean))(ROW[::1], int64[::1], float64[:, ::1],"
-    " float64[:, ::1], float64[:, ::1], float64[::1], int64[::1], float64, float64, boolean, int64, float64,"
-    " float64[::1])",
-    ROW=ROW,
-)
-def prepare(
-    rows: RowTable,
-    start: IntArray,
-    accel: Matrix,
-    accel_variance: Matrix,
-    information: Matrix,
-    vector: Vector,
-    extra: IntArray,
-    dt: float,
-    eps: float,
-    with_gains: bool,
-    max_iterations: int,
-    tolerance: float,
-    first_state: Vector,
-) -> tuple[
-    bool, IntArray, int, Matrix, Vector, Matrix, Matrix,
-    IntArray, Matrix, IntArray, Matrix, Matrix, Matrix, Vector, Matrix, Matrix, float, float,
-    Vector, bool,
-]:  # fmt: skip
-    """Region, window, unconstrained optimum z and whether it was reached; arguments as `moving_horizon_step`.
+class Prepared(NamedTuple):
+    """A window ready for the constrained step."""
+
+    region: Region
+    window: Window
+    z: Vector
+    """Its unconstrained optimum."""
+    converged: bool
+    """Whether that was reached."""
+
+
+PREPARED = structure(Prepared, "REGION, WINDOW, float64[::1], boolean", REGION=REGION, WINDOW=WINDOW)
+
+
+@entry("PREPARED(PROBLEM, OPTIONS, float64[::1])", PREPARED=PREPARED, PROBLEM=PROBLEM, OPTIONS=OPTIONS)
+def prepare(problem: WindowProblem, options: StepOptions, first_state: Vector) -> Prepared:
+    """Reduce a window and give its unconstrained optimum.
 
     ``first_state`` ``(6n,)`` is that optimum's first state: all of z with pre-estimation, computed again
     without.
     """
-    region, w = regional_problem(
-        rows, start, accel, accel_variance, information, vector, extra, dt, eps, with_gains
-    )
+    problem, options = WindowProblem(*problem), StepOptions(*options)
+    region, w = regional_problem(problem, options.eps)
     d = w.prior_mean.shape[0]
     z = np.zeros(d + w.noise_precision.size)
     z[:d] = w.prior_mean
     converged = False
-    if with_gains:
+    if problem.with_gains:
         gather(first_state, region.order, region.outside, STATES_PER_AGENT, z)
         converged = True
     elif region.definite:
-        converged = minimise(w, z, max_iterations, tolerance)[3]
-    return (
-        region.definite, region.order, region.outside, region.root, region.mean, region.covariance,
-        region.base_units,
-        w.code, w.data, w.start, w.accel, w.noise_precision, w.gains, w.prior_mean, w.prior_root,
-        w.prior_information, w.dt, w.eps,
-        z, converged,
-    )  # fmt: skip
+        converged = minimise(w, z, options.max_iterations, options.tolerance)[3]
+    return Prepared(region, w, z, converged)
 
 
-@entry(f"float64({_WINDOW}, float64[::1], int64, float64[:, ::1], float64[::1])")
-def evaluate(
-    code: IntArray,
-    data: Matrix,
-    start: IntArray,
-    accel: Matrix,
-    noise_precision: Matrix,
-    gains: Matrix,
-    prior_mean: Vector,
-    prior_root: Matrix,
-    prior_information: Matrix,
-    dt: float,
-    eps: float,
-    z: Vector,
-    bounds_on: int,
-    states: Matrix,
-    bounded: Vector,
-) -> float:
+@entry("float64(WINDOW, float64[::1], int64, float64[:, ::1], float64[::1])", WINDOW=WINDOW)
+def evaluate(window: Window, z: Vector, bounds_on: int, states: Matrix, bounded: Vector) -> float:
     """Objective f(z); fills the states ``(N+1, d)`` and the residuals ``(m,)`` that noise bounds hold for."""
-    window = Window(
-        code, data, start, accel, noise_precision, gains, prior_mean, prior_root, prior_information, dt, eps
-    )
+    window = Window(*window)
     path = empty_trajectory(window)
     value = roll_out(window, z, path)
     states[:, :] = path.states
@@ -114,58 +73,59 @@ def evaluate(
     return value
 
 
-@entry(
-    f"boolean({_WINDOW}, float64[::1], int64, float64[::1], float64[:, ::1], boolean, boolean, float64[::1],"
-    " float64[:, ::1], float64[:, ::1])"
-)
-def linearise_bounds(
-    code: IntArray,
-    data: Matrix,
-    start: IntArray,
-    accel: Matrix,
-    noise_precision: Matrix,
-    gains: Matrix,
-    prior_mean: Vector,
-    prior_root: Matrix,
-    prior_information: Matrix,
-    dt: float,
-    eps: float,
-    z: Vector,
-    bounds_on: int,
-    multipliers: Vector,
-    state_multipliers: Matrix,
-    exact: bool,
-    boxed: bool,
-    linear: Vector,
-    inverse_root: Matrix,
-    rows: Matrix,
-) -> bool:
-    """One quadratic program at z, in the variables q = U step with U'U the Hessian.
+class BoundPoint(NamedTuple):
+    """Where bounds are linearised, and what holds there."""
 
-    The Hessian is Gauss-Newton's of f, or (``exact``, where it is definite) the Lagrangian's with
-    ``multipliers`` ``(m,)`` on the bounded residuals and ``state_multipliers`` ``(N+1, d)`` on the states.
-    ``linear`` gets U'^-1 df/dz, ``inverse_root`` U^-1, and ``rows`` ``(m + (N+1) d, variables)`` the
-    derivatives of the bounded residuals and, if ``boxed``, of the states, times U^-1. False where the
-    Hessian cannot be factored.
+    z: Vector
+    multipliers: Vector
+    """``(m,)`` on the bounded residuals."""
+    state_multipliers: Matrix
+    """``(N+1, d)`` on the states."""
+    bounds_on: int
+    boxed: bool
+    """Whether the states are bounded."""
+
+
+class LinearProgram(NamedTuple):
+    """Room for the quadratic program at a point, in the variables q = U step with U'U the Hessian."""
+
+    linear: Vector
+    """U'^-1 df/dz."""
+    inverse_root: Matrix
+    """U^-1."""
+    rows: Matrix
+    """``(m + (N+1) d, variables)``: derivatives of bounded residuals and, if ``boxed``, of the states, times U^-1."""
+
+
+POINT = structure(BoundPoint, "float64[::1], float64[::1], float64[:, ::1], int64, boolean")
+PROGRAM = structure(LinearProgram, "float64[::1], float64[:, ::1], float64[:, ::1]")
+
+
+@entry("boolean(WINDOW, POINT, boolean, PROGRAM)", WINDOW=WINDOW, POINT=POINT, PROGRAM=PROGRAM)
+def linearise_bounds(window: Window, point: BoundPoint, exact: bool, out: LinearProgram) -> bool:
+    """out <- one quadratic program at a point.
+
+    The Hessian is Gauss-Newton's of f, or (``exact``, where it is definite) the Lagrangian's with the point's
+    multipliers. False where it cannot be factored.
     """
-    window = Window(
-        code, data, start, accel, noise_precision, gains, prior_mean, prior_root, prior_information, dt, eps
-    )
+    window, point, out = Window(*window), BoundPoint(*point), LinearProgram(*out)
+    z, bounds_on, linear = point.z, point.bounds_on, out.linear
     path = empty_trajectory(window)
     roll_out(window, z, path)
     set_weights(window, path)
     gradient(window, z, path, linear)
     n = z.shape[0]
+    m = window.code.shape[0]
     curvature = np.empty((n, n))
     sensitivities = np.empty((path.states.size, n))
     if exact:
         set_weights(window, path)
-        for r in range(code.shape[0]):
+        for r in range(m):
             if bounds_on == CORRECTED:
-                path.weights[r] += multipliers[r]
+                path.weights[r] += point.multipliers[r]
             else:
-                path.predicted_weights[r] = multipliers[r]
-        path.state_weights[:, :] = state_multipliers
+                path.predicted_weights[r] = point.multipliers[r]
+        path.state_weights[:, :] = point.state_multipliers
         gradient(window, z, path, np.empty(n))
         hessian(window, path, True, curvature, sensitivities)
         exact = factor_upper(curvature)
@@ -173,16 +133,15 @@ def linearise_bounds(
         hessian(window, path, False, curvature, sensitivities)
         if not factor_upper(curvature):
             return False
-    _invert_upper(curvature, inverse_root)
+    _invert_upper(curvature, out.inverse_root)
     solve_upper_transposed(curvature, linear)
-    slopes = np.empty((code.shape[0], n))
+    slopes = np.empty((m, n))
     _bound_slopes(window, path, bounds_on, sensitivities, slopes)
-    m = code.shape[0]
-    rows[:m] = np.dot(slopes, inverse_root)
-    if boxed:
-        rows[m:] = np.dot(sensitivities, inverse_root)
+    out.rows[:m] = np.dot(slopes, out.inverse_root)
+    if point.boxed:
+        out.rows[m:] = np.dot(sensitivities, out.inverse_root)
     else:
-        rows[m:] = 0.0
+        out.rows[m:] = 0.0
     return True
 
 
@@ -226,44 +185,17 @@ def _bound_slopes(
 
 
 @entry(
-    f"boolean({_REGION}, {_WINDOW}, float64[::1], ROW[::1], float64[:, ::1], float64[:, ::1],"
-    " float64[:, ::1], float64[:, ::1], float64[:, ::1])",
-    ROW=ROW,
+    "boolean(REGION, WINDOW, float64[::1], PROBLEM, float64[:, ::1], float64[:, ::1])",
+    REGION=REGION,
+    WINDOW=WINDOW,
+    PROBLEM=PROBLEM,
 )
 def finish(
-    definite: bool,
-    order: IntArray,
-    outside: int,
-    root: Matrix,
-    mean: Vector,
-    covariance: Matrix,
-    base_units: Matrix,
-    code: IntArray,
-    data: Matrix,
-    start: IntArray,
-    accel: Matrix,
-    noise_precision: Matrix,
-    gains: Matrix,
-    prior_mean: Vector,
-    prior_root: Matrix,
-    prior_information: Matrix,
-    dt: float,
-    eps: float,
-    z: Vector,
-    rows: RowTable,
-    fleet_accel: Matrix,
-    fleet_accel_variance: Matrix,
-    information: Matrix,
-    states: Matrix,
-    next_information: Matrix,
+    region: Region, window: Window, z: Vector, problem: WindowProblem, states: Matrix, next_information: Matrix
 ) -> bool:
     """From z to the fleet's states ``(N+1, 6n)`` and the next arrival cost; see `moving_horizon_step`."""
-    region = Region(definite, order, outside, root, mean, covariance, base_units)
-    window = Window(
-        code, data, start, accel, noise_precision, gains, prior_mean, prior_root, prior_information, dt, eps
-    )
+    region, window, problem = Region(*region), Window(*window), WindowProblem(*problem)
     path = empty_trajectory(window)
     roll_out(window, z, path)
-    write_states(region, window, path, fleet_accel, True, states)
-    updates = rows[start[1] : start[2]]
-    return arrival_update(information, updates, states[1], fleet_accel_variance[0], dt, eps, next_information)
+    write_states(region, window, path, problem.accel, True, states)
+    return arrival_update(problem, states[1], window.eps, next_information)

@@ -11,12 +11,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from estimators.compiled.entries import plain
 from estimators.estimator import Estimate, Status
 from estimators.model.gaussian import symmetrised
 from estimators.model.measurements import ROW, Matrix, RowTable
 from estimators.model.members import InformationState
 from estimators.window.history import MeasurementWindow
-from estimators.window.marginalization import filter_reweighted
+from estimators.window.marginalization import Filtering, filter_reweighted
 from estimators.window.types import WindowProblem, WindowSolution
 
 
@@ -43,29 +44,16 @@ def filtered_arrival(problem: WindowProblem, path: Matrix, norm_smoothing: float
     Raises ``ArithmeticError`` where a belief on the way is not positive definite.
     """
     n = len(problem.vector)
-    information, mean, covariance = np.empty((n, n)), np.empty(n), np.empty((n, n))
-    rows = np.empty(len(problem.rows), ROW)
-    sound = filter_reweighted(
-        problem.rows,
-        problem.start,
-        problem.accel,
-        problem.accel_variance,
-        np.ascontiguousarray(path),
-        problem.period_s,
-        norm_smoothing,
-        problem.information,
-        problem.vector,
-        rows,
-        information,
-        mean,
-        covariance,
-    )
-    if not sound:
+    found = Filtering(np.empty(len(problem.rows), ROW), np.empty((n, n)), np.empty(n), np.empty((n, n)))
+    if not filter_reweighted(plain(problem), np.ascontiguousarray(path), norm_smoothing, plain(found)):
         raise ArithmeticError("the window's information is not positive definite")
-    if not slide:
+    if slide:
+        arrival = InformationState(found.mean, found.information)
+    else:
         information = np.ascontiguousarray(problem.information)
         mean = np.asarray(np.linalg.solve(information, problem.vector), np.float64)
-    return Filtered(InformationState(mean, information), symmetrised(covariance), rows)
+        arrival = InformationState(mean, information)
+    return Filtered(arrival, symmetrised(found.covariance), found.rows)
 
 
 def first_estimate(window: MeasurementWindow, prior: InformationState) -> Estimate:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.consensus.information import Pairs
 from estimators.model.gaussian import Pair
 from estimators.model.layout import Layout
 from estimators.settings import EstimatorSettings, fade_per_tick
@@ -25,12 +24,12 @@ def open_window(settings: EstimatorSettings, layout: Layout, period_s: float) ->
 
 
 def window_problem(
-    window: MeasurementWindow, prior: tuple[Pair, Pairs], slot: int, period_s: float, with_gains: bool
+    window: MeasurementWindow, prior: Pair, slot: int, period_s: float, with_gains: bool
 ) -> WindowProblem:
-    """The least-squares problem of a window from what `Fusion.unfused` gives; the agent itself stays in it."""
+    """The least-squares problem of a window; ``prior``: the fused pair at its start. The agent itself stays in it."""
     rows, start = window.rows()
     accel, variance = window.inputs()
-    (information, vector), pairs = prior
+    information, vector = prior
     return WindowProblem(
         rows=rows,
         start=start,
@@ -41,5 +40,4 @@ def window_problem(
         keep=np.array([slot], np.int64),
         period_s=period_s,
         with_gains=with_gains,
-        pairs=pairs,
     )

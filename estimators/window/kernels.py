@@ -11,19 +11,17 @@ where s collects the innovations that the frozen gains carry into O over the win
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.compiled.linear_algebra import factor_upper, inverse_from_cholesky, solve_upper
-from estimators.consensus.information import combine
+from estimators.consensus.information import PAIRS, Pairs, combine
 from estimators.model.corrections import add_row_information
 from estimators.model.layout import STATES_PER_AGENT
-from estimators.model.measurements import ROW, Matrix, RowTable, Vector
+from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import predict_information, predict_state, transpose_predict
 from estimators.model.row_kernels import (
     HALF_WIDTH,
     PRECISION,
-    IntArray,
     add_gradient,
     encode_rows,
 )
@@ -31,15 +29,19 @@ from estimators.solvers.gauss_newton import minimise
 from estimators.window.pre_estimation import pre_estimate
 from estimators.window.problem import Trajectory, Window
 from estimators.window.regional import Region, regional_problem, scatter
+from estimators.window.types import (
+    CORRECTED,
+    NOTHING,
+    OPTIONS,
+    PROBLEM,
+    StepOptions,
+    WindowProblem,
+)
 
 CONVERGED = 0
 NOT_CONVERGED = 1
 UNUSABLE = 2
 """The prior is not positive definite, or a result is not finite."""
-
-NOTHING = 0
-CORRECTED = 1
-PREDICTED = 2
 
 
 @kernel
@@ -88,72 +90,32 @@ def _outside_states(
 
 
 @kernel
-def arrival_update(
-    information: Matrix,
-    rows: RowTable,
-    state: Vector,
-    accel_variance: Vector,
-    dt: float,
-    eps: float,
-    out: Matrix,
-) -> bool:
-    """out <- information of (17)-(18): predicted over one tick, updated by rows linearised at ``state``."""
-    out[:, :] = information
-    if not predict_information(out, accel_variance, dt):
+def arrival_update(problem: WindowProblem, state: Vector, eps: float, out: Matrix) -> bool:
+    """out <- information of (17)-(18): predicted over one tick, updated by its rows linearised at ``state``."""
+    out[:, :] = problem.information
+    if not predict_information(out, problem.accel_variance[0], problem.period_s):
         return False
-    add_row_information(rows, state, eps, out)
+    add_row_information(problem.rows[problem.start[1] : problem.start[2]], state, eps, out)
     return True
 
 
 @entry(
-    "Tuple((int64, int64, float64, boolean))(float64[::1], float64[:, :, ::1], float64[:, ::1], ROW[::1],"
-    " int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], int64[::1], float64, float64,"
-    " boolean, int64, float64, float64, int64, float64, float64[::1], float64[:, ::1], float64[:, ::1])",
-    ROW=ROW,
+    "Tuple((int64, int64, float64, boolean))(PAIRS, PROBLEM, OPTIONS, float64[:, ::1], float64[:, ::1])",
+    PAIRS=PAIRS,
+    PROBLEM=PROBLEM,
+    OPTIONS=OPTIONS,
 )
 def moving_horizon_step(
-    weights: Vector,
-    informations: NDArray[np.float64],
-    vectors: Matrix,
-    rows: RowTable,
-    start: IntArray,
-    accel: Matrix,
-    accel_variance: Matrix,
-    information: Matrix,
-    vector: Vector,
-    extra: IntArray,
-    dt: float,
-    eps: float,
-    with_gains: bool,
-    bounds_on: int,
-    box_position: float,
-    box_speed: float,
-    max_iterations: int,
-    tolerance: float,
-    prior_mean: Vector,
-    states: Matrix,
-    next_information: Matrix,
+    pairs: Pairs, problem: WindowProblem, options: StepOptions, states: Matrix, next_information: Matrix
 ) -> tuple[int, int, float, bool]:
     """One unconstrained step: consensus (13)-(16), window optimum (5)-(10), next arrival cost (17)-(18).
 
     Parameters
     ----------
-    weights, informations, vectors
-        `Pairs` to be fused into ``information`` and ``vector``; without any, those hold the fused pair already.
-    rows, start
-        Rows sorted by tick; ``start`` ``(N+2,)`` first row of each tick, then their number.
-    accel, accel_variance : ``(N, 3n)``
-        Accelerations assumed over each tick and the variances of their noise.
-    information, vector : ``(6n, 6n)``, ``(6n,)``
-        Fused prior information pair at the window's start, (15)-(16).
-    extra
-        Slots that are kept in the optimisation although no row names them (the agent itself).
-    with_gains
-        EKF pre-estimation; otherwise input corrections are variables (DMHE-1).
-    bounds_on, box_position, box_speed
-        Which bounds to check afterwards: noise bounds on `NOTHING`, `CORRECTED` or `PREDICTED` residuals, and
-        the largest position and velocity component, m and m/s (inf: none).
-    prior_mean : ``(6n,)``, out
+    pairs
+        What is to be fused into the problem's prior; without any, it is fused already.
+    problem, options
+        The window, and how to solve it. The bounds of the options are checked afterwards.
     states : ``(N+1, 6n)``, out
         States of the window given everything in it. Agents outside the optimisation are exact at the first
         two ticks and the last, and at the others only where there is a box (nothing else needs them).
@@ -165,23 +127,21 @@ def moving_horizon_step(
     status (`CONVERGED`, `NOT_CONVERGED`, `UNUSABLE`), iterations, optimal cost (9) without factor 1/2,
     whether all bounds hold.
     """
-    if weights.shape[0] > 0:
-        combine(weights, informations, vectors, information, vector)
-    region, window = regional_problem(
-        rows, start, accel, accel_variance, information, vector, extra, dt, eps, with_gains
-    )
+    pairs, problem, options = Pairs(*pairs), WindowProblem(*problem), StepOptions(*options)
+    if pairs.weights.shape[0] > 0:
+        combine(pairs, problem.information, problem.vector)
+    region, window = regional_problem(problem, options.eps)
     if not region.definite:
         return UNUSABLE, 0, 0.0, True
-    scatter(region.mean, region.order, 0, prior_mean)
     d = window.prior_mean.shape[0]
     z = np.zeros(d + window.noise_precision.size)
     z[:d] = window.prior_mean
-    path, value, iterations, converged = minimise(window, z, max_iterations, tolerance)
+    path, value, iterations, converged = minimise(window, z, options.max_iterations, options.tolerance)
+    box_position, box_speed = options.box_position, options.box_speed
     boxed = np.isfinite(box_position) or np.isfinite(box_speed)
-    write_states(region, window, path, accel, boxed, states)
-    hold = bounds_hold(window, path, bounds_on) and (not boxed or in_box(states, box_position, box_speed))
-    update_from = rows[start[1] : start[2]]
-    if not arrival_update(information, update_from, states[1], accel_variance[0], dt, eps, next_information):
+    write_states(region, window, path, problem.accel, boxed, states)
+    hold = bounds_hold(window, path, options.bounds_on) and (not boxed or in_box(states, box_position, box_speed))
+    if not arrival_update(problem, states[1], options.eps, next_information):
         return UNUSABLE, iterations, 2.0 * value, hold
     if not (np.isfinite(states).all() and np.isfinite(next_information).all()):
         return UNUSABLE, iterations, 2.0 * value, hold
@@ -233,29 +193,20 @@ def write_states(
 
 
 @entry(
-    "boolean(ROW[::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1], float64,"
-    " float64, float64[::1], float64[:, ::1])",
-    ROW=ROW,
+    "boolean(PROBLEM, float64[::1], float64, float64[::1], float64[:, ::1])",
+    PROBLEM=PROBLEM,
 )
-def filter_window(
-    rows: RowTable,
-    start: IntArray,
-    accel: Matrix,
-    accel_variance: Matrix,
-    information: Matrix,
-    prior_mean: Vector,
-    dt: float,
-    eps: float,
-    mean: Vector,
-    covariance: Matrix,
-) -> bool:
-    """Run the EKF of the pre-estimation over a window for the whole fleet.
+def filter_window(problem: WindowProblem, prior_mean: Vector, eps: float, mean: Vector, covariance: Matrix) -> bool:
+    """Run the EKF of the pre-estimation over a window for the whole fleet, from its fused prior.
 
-    Gives its mean ``(6n,)`` at the window's end and Pi_pre,t|t (22) ``(6n, 6n)``; the window's first rows
-    are not used, as in (20)-(23). False where the prior is not positive definite.
+    ``prior_mean`` ``(6n,)`` is that of the prior. Gives the mean ``(6n,)`` at the window's end and Pi_pre,t|t (22)
+    ``(6n, 6n)``; the window's first rows are not used, as in (20)-(23). False where the prior is not positive
+    definite.
     """
+    problem = WindowProblem(*problem)
+    rows = problem.rows
     agents = prior_mean.shape[0] // STATES_PER_AGENT
-    root = information.copy()
+    root = problem.information.copy()
     if not factor_upper(root):
         return False
     inverse_from_cholesky(root, covariance)
@@ -266,5 +217,8 @@ def filter_window(
     gains = np.zeros((m, prior_mean.shape[0]))
     units = np.zeros((m, 4))
     mean[:] = prior_mean
-    pre_estimate(code, data, start, accel, accel_variance, mean, dt, eps, covariance, gains, units)
+    pre_estimate(
+        code, data, problem.start, problem.accel, problem.accel_variance, mean, problem.period_s, eps,
+        covariance, gains, units,
+    )  # fmt: skip
     return True

@@ -15,7 +15,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.compiled.entries import kernel
+from estimators.compiled.entries import kernel, structure
 from estimators.compiled.linear_algebra import LIBRARY_SIZE, add_outer_upper, multiply
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import predict_sensitivity, predict_state, transpose_predict, transpose_predict_all
@@ -56,6 +56,13 @@ class Window(NamedTuple):
     """``(d, d)``, upper triangle."""
     dt: float
     eps: float
+
+
+WINDOW = structure(
+    Window,
+    "int64[:, ::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1], float64[::1],"
+    " float64[:, ::1], float64[:, ::1], float64, float64",
+)
 
 
 class Trajectory(NamedTuple):

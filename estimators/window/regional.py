@@ -12,13 +12,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from estimators.compiled.entries import kernel
+from estimators.compiled.entries import kernel, structure
 from estimators.compiled.linear_algebra import cholesky_solve, factor_upper, inverse_from_cholesky
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.row_kernels import IntArray, encode_rows
 from estimators.window.pre_estimation import pre_estimate
 from estimators.window.problem import Window
+from estimators.window.types import WindowProblem
 
 
 @kernel
@@ -95,29 +96,27 @@ class Region(NamedTuple):
     """``(m, 4)`` gradients that the frozen gains were computed with."""
 
 
+REGION = structure(
+    Region,
+    "boolean, int64[::1], int64, float64[:, ::1], float64[::1], float64[:, ::1], float64[:, ::1]",
+)
+
+
 @kernel
-def regional_problem(
-    rows: RowTable,
-    start: IntArray,
-    accel: Matrix,
-    accel_variance: Matrix,
-    information: Matrix,
-    vector: Vector,
-    extra: IntArray,
-    dt: float,
-    eps: float,
-    with_gains: bool,
-) -> tuple[Region, Window]:
-    """Reduce the window to the agents of its rows; arguments as in `moving_horizon_step`."""
+def regional_problem(problem: WindowProblem, eps: float) -> tuple[Region, Window]:
+    """Reduce a window to the agents of its rows."""
+    rows, start, dt, with_gains = problem.rows, problem.start, problem.period_s, problem.with_gains
+    accel, accel_variance = problem.accel, problem.accel_variance
+    information = problem.information
     agents = information.shape[0] // STATES_PER_AGENT
-    order, outside = regional_order(rows, extra, agents)
+    order, outside = regional_order(rows, problem.keep, agents)
     regional = agents - outside
     ordered = _permuted(information, order)
     root = ordered.copy()
     definite = factor_upper(root)
     mean = np.zeros(information.shape[0])
     if definite:
-        gather(vector, order, 0, STATES_PER_AGENT, mean)
+        gather(problem.vector, order, 0, STATES_PER_AGENT, mean)
         cholesky_solve(root, mean)
     first = STATES_PER_AGENT * outside
     d = STATES_PER_AGENT * regional

@@ -4,49 +4,31 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.compiled.entries import plain
+from estimators.consensus.information import NO_PAIRS, Pairs
 from estimators.estimator import SolverReport, Status
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import predict_mean
 from estimators.settings import EstimatorSettings
-from estimators.solvers.constrained import bound_kind, box, solve_constrained
-from estimators.window.kernels import (
-    NOT_CONVERGED,
-    UNUSABLE,
-    filter_window,
-    moving_horizon_step,
-)
+from estimators.solvers.constrained import solve_constrained, step_options
+from estimators.window.kernels import NOT_CONVERGED, UNUSABLE, filter_window, moving_horizon_step
 from estimators.window.types import WindowProblem, WindowSolution
 
 
 def solve_window(
-    problem: WindowProblem, settings: EstimatorSettings, budget: int | None = None
+    problem: WindowProblem, settings: EstimatorSettings, budget: int | None = None, pairs: Pairs = NO_PAIRS
 ) -> WindowSolution:
     """Optimum of (5)-(10) and the next arrival cost (17)-(18), with at most ``budget`` iterations.
 
+    ``pairs``, the last round of consensus, are fused first: into the problem's prior, which is room for it.
     Falls back to the pre-estimate, and says so in the status, where the optimisation cannot be run.
     """
     n = len(problem.vector)
     path, next_information = np.empty((len(problem.accel) + 1, n)), np.empty((n, n))
     limit = settings.max_iterations if budget is None else min(budget, settings.max_iterations)
+    options = step_options(settings, problem.with_gains, limit)
     outcome, iterations, cost, bounds_hold = moving_horizon_step(
-        *problem.pairs,
-        problem.rows,
-        problem.start,
-        problem.accel,
-        problem.accel_variance,
-        problem.information,
-        problem.vector,
-        problem.keep,
-        problem.period_s,
-        settings.norm_smoothing_m,
-        problem.with_gains,
-        bound_kind(settings, problem.with_gains),
-        *box(settings),
-        limit,
-        settings.tolerance,
-        np.empty(n),
-        path,
-        next_information,
+        plain(pairs), plain(problem), plain(options), path, next_information
     )
     if outcome == UNUSABLE:
         return _fallback(problem)
@@ -63,19 +45,7 @@ def pre_estimation(problem: WindowProblem, norm_smoothing: float) -> tuple[Vecto
     """
     n = len(problem.vector)
     mean, covariance = np.empty(n), np.empty((n, n))
-    prior_mean = _prior_mean(problem)
-    if not filter_window(
-        problem.rows,
-        problem.start,
-        problem.accel,
-        problem.accel_variance,
-        problem.information,
-        prior_mean,
-        problem.period_s,
-        norm_smoothing,
-        mean,
-        covariance,
-    ):
+    if not filter_window(plain(problem), _prior_mean(problem), norm_smoothing, mean, covariance):
         raise np.linalg.LinAlgError("the prior information of the window is not positive definite")
     return mean, covariance
 

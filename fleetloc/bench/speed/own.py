@@ -16,13 +16,14 @@ from fleetloc.bench.speed.windows import PERIOD_S, BenchWindow
 
 def our_step(window: BenchWindow, settings: EstimatorSettings) -> WindowSolution:
     """Consensus fuse, window, next arrival cost."""
-    return solve_window(window.unfused_problem(), settings)
+    problem, pairs = window.unfused_problem()
+    return solve_window(problem, settings, pairs=pairs)
 
 
 def our_step_with_covariance(window: BenchWindow, settings: EstimatorSettings) -> WindowSolution:
     """The same, and the covariance (22) that the agent publishes with its estimate."""
-    problem = window.unfused_problem()
-    solution = solve_window(problem, settings)
+    problem, pairs = window.unfused_problem()
+    solution = solve_window(problem, settings, pairs=pairs)
     pre_estimation(problem, settings.norm_smoothing_m)
     return solution
 

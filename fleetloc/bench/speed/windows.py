@@ -13,7 +13,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from estimators.consensus.information import NO_PAIRS, Pairs, fuse, weigh
+from estimators.consensus.information import Pairs, fuse, weigh
 from estimators.estimator import Estimate, Estimator, Payload
 from estimators.factory import make_estimator
 from estimators.model.layout import Layout
@@ -104,14 +104,14 @@ class BenchWindow:
         """The information pair ``(6n, 6n)``, ``(6n,)`` after the consensus round."""
         return fuse(self.own, self.received, "observability_rank", self.ranks)
 
-    def unfused_problem(self) -> WindowProblem:
-        """The window's problem as the agent solves it: the consensus round still to be done."""
+    def unfused_problem(self) -> tuple[WindowProblem, Pairs]:
+        """The window's problem as the agent solves it, with the consensus round still to be done."""
         n = len(self.own.vector)
         pairs = weigh(self.own, self.received, "observability_rank", self.ranks)
-        return self.problem((np.empty((n, n)), np.empty(n)), pairs)
+        return self.problem((np.empty((n, n)), np.empty(n))), pairs
 
-    def problem(self, pair: tuple[Matrix, Vector], pairs: Pairs = NO_PAIRS) -> WindowProblem:
-        """The window's problem with a fused pair, or with room for one and the pairs to fuse."""
+    def problem(self, pair: tuple[Matrix, Vector]) -> WindowProblem:
+        """The window's problem with a fused pair, or with room for one."""
         return WindowProblem(
             rows=self.rows,
             start=self.start,
@@ -122,7 +122,6 @@ class BenchWindow:
             keep=self.keep,
             period_s=PERIOD_S,
             with_gains=True,
-            pairs=pairs,
         )
 
     def regional_agents(self) -> int:

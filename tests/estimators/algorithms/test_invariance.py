@@ -137,15 +137,14 @@ def test_window_in_any_rotated_frame(with_gains: bool) -> None:
     # the input noise, so it is made the same in all axes
     rng = np.random.default_rng(2)
     problem, _ = builders.random_window(rng, agents=3, ticks=3, with_gains=with_gains)
-    problem = replace(problem, accel_variance=np.full_like(problem.accel_variance, 0.3))
+    problem = problem._replace(accel_variance=np.full_like(problem.accel_variance, 0.3))
     turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     fleet = fleet_matrix(turn, 3)
     rows = problem.rows.copy()
     vectors = np.stack([rows["x"], rows["y"], rows["z"]], axis=1) @ turn.T
     rows["x"], rows["y"], rows["z"] = vectors.T
     information = fleet @ problem.information @ fleet.T
-    turned = replace(
-        problem,
+    turned = problem._replace(
         rows=rows,
         accel=np.ascontiguousarray((problem.accel.reshape(-1, 3) @ turn.T).reshape(problem.accel.shape)),
         information=np.ascontiguousarray(0.5 * (information + information.T)),
@@ -170,7 +169,7 @@ def test_window_a_kilometre_away(with_gains: bool) -> None:
     anchors = rows["kind"] == Kind.ANCHOR_RANGE
     for axis, name in enumerate("xyz"):
         rows[name] += np.where(anchors, shift[axis], 0.0)
-    moved = replace(problem, rows=rows, vector=problem.vector + problem.information @ whole)
+    moved = problem._replace(rows=rows, vector=problem.vector + problem.information @ whole)
     path, information = solved(problem)
     moved_path, moved_information = solved(moved)
     np.testing.assert_allclose(moved_path - whole, path, rtol=0, atol=ROUNDING_M)

@@ -8,22 +8,21 @@ derivative and a rounding of about 1e-11 times the function; the tolerances belo
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from estimators.algorithms.dekf_ci import predict_and_correct
+from estimators.compiled.entries import plain
 from estimators.integrity.observability import observability_matrix, row_jacobian
 from estimators.model.measurements import Kind, empty_rows
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix
-from estimators.solvers.constrained_kernels import evaluate, linearise_bounds, prepare
+from estimators.solvers.constrained_kernels import BoundPoint, LinearProgram, evaluate, linearise_bounds, prepare
 from estimators.solvers.gauss_newton import set_weights
-from estimators.window.kernels import CORRECTED, PREDICTED
-from estimators.window.problem import Window, correction_hessian, empty_trajectory, gradient, hessian, roll_out
+from estimators.window.problem import correction_hessian, empty_trajectory, gradient, hessian, roll_out
 from estimators.window.solving import pre_estimation
-from estimators.window.types import WindowProblem
+from estimators.window.types import CORRECTED, NOTHING, PREDICTED, StepOptions, WindowProblem
 from tests.support import builders
 from tests.support import dense_reference as dense
 
@@ -31,10 +30,6 @@ Array = NDArray[np.float64]
 STEP = 1e-5
 EPS = 0.1
 """Smoothing of the norms here: with 1e-3 a coincident pair has third derivatives of 1e6, beyond differences."""
-
-_PREPARE: Any = prepare
-_EVALUATE: Any = evaluate
-_LINEARISE: Any = linearise_bounds
 
 
 def differences(function: Callable[[Array], Array], x: Array) -> Array:
@@ -51,19 +46,16 @@ class Kernels:
     """The compiled window of a problem, called at one z after the other."""
 
     def __init__(self, problem: WindowProblem, eps: float) -> None:
-        prepared = _PREPARE(
-            problem.rows, problem.start, problem.accel, problem.accel_variance, problem.information,
-            problem.vector, problem.keep, problem.period_s, eps, problem.with_gains, 1, 1e-6,
-            np.zeros_like(problem.vector),
-        )  # fmt: skip
-        assert prepared[0], "the prior is definite"
-        assert prepared[2] == 0, "all agents are in the rows, in their own order"
-        self.window = prepared[7:18]
+        options = StepOptions(eps, NOTHING, np.inf, np.inf, 1, 1e-6)
+        prepared = prepare(plain(problem), plain(options), np.zeros_like(problem.vector))
+        assert prepared.region.definite, "the prior is definite"
+        assert prepared.region.outside == 0, "all agents are in the rows, in their own order"
+        self.window = prepared.window
         self.rows, self.states = len(problem.rows), (len(problem.accel) + 1, len(problem.vector))
 
     def values(self, z: Array, bounds_on: int) -> tuple[float, Array, Array]:
         states, bounded = np.empty(self.states), np.empty(self.rows)
-        return float(_EVALUATE(*self.window, z, bounds_on, states, bounded)), states, bounded
+        return evaluate(plain(self.window), z, bounds_on, states, bounded), states, bounded
 
     def derivatives(
         self, z: Array, bounds_on: int, row_force: Array, state_force: Array, *, exact: bool
@@ -72,8 +64,9 @@ class Kernels:
         n = len(z)
         linear, inverse_root = np.empty(n), np.empty((n, n))
         rows = np.empty((self.rows + self.states[0] * self.states[1], n))
-        forces = row_force, state_force
-        assert _LINEARISE(*self.window, z, bounds_on, *forces, exact, True, linear, inverse_root, rows)
+        point = BoundPoint(z, row_force, state_force, bounds_on, True)
+        made = LinearProgram(linear, inverse_root, rows)
+        assert linearise_bounds(plain(self.window), plain(point), exact, plain(made))
         root = np.linalg.inv(inverse_root)  # the program is in the variables U step: back to z
         scaled = rows @ root
         return root.T @ linear, root.T @ root, scaled[self.rows :], scaled[: self.rows]
@@ -152,7 +145,7 @@ def test_window_gradient_and_hessians(kinds: tuple[Kind, ...], with_gains: bool)
 def test_without_gains_the_adjoint_recursion_gives_the_hessian(exact: bool) -> None:
     # GIVEN a window of input corrections at a point
     problem, z = window_at_a_point(2, builders.ALL_KINDS, with_gains=False)
-    window = Window(*Kernels(problem, EPS).window)
+    window = Kernels(problem, EPS).window
     path, slope = empty_trajectory(window), np.empty(len(z))
     roll_out(window, z, path)
     set_weights(window, path)

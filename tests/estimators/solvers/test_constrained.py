@@ -6,8 +6,6 @@ the right signs, within the price of the soft bounds.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import msgspec
 import numpy as np
 import pytest
@@ -81,7 +79,7 @@ def tightened(problem: WindowProblem, bounds_on: str, fraction: float) -> Window
     half[largest] = fraction * np.abs(residuals[largest])
     rows = problem.rows.copy()
     rows["half_width"][problem.start[1] :] = half
-    return replace(problem, rows=rows)
+    return problem._replace(rows=rows)
 
 
 def check_conditions(
@@ -230,7 +228,7 @@ def test_box_that_cannot_be_kept(name: str) -> None:
     # no start keeps the speed within 1 cm/s for three ticks
     rng = np.random.default_rng(1)
     problem, _ = builders.random_window(rng, agents=1, ticks=2, kinds=builders.LINEAR_KINDS, rows_per_agent=0)
-    problem = replace(problem, accel=np.full((2, 3), 2.0))
+    problem = problem._replace(accel=np.full((2, 3), 2.0))
     settings = msgspec.structs.replace(BASE, state_box_speed_mps=0.01, qp=name)
     # WHEN it is solved, THEN it says that it fell back, and gives the prior's prediction
     solution = solve_window(problem, settings)
@@ -246,7 +244,7 @@ def test_first_tick_has_no_bounds() -> None:
     rows = problem.rows.copy()
     rows["half_width"][: problem.start[1]] = 1e-6
     rows["half_width"][problem.start[1] :] = 50.0
-    problem = replace(problem, rows=rows)
+    problem = problem._replace(rows=rows)
     solution = solve_window(problem, SOFT)
     assert solution.report.qp_solves == 0
     np.testing.assert_array_equal(solution.path, solve_window(problem, BASE).path)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -59,7 +58,7 @@ def test_any_order_of_arrival_gives_the_same_window(seed: int) -> None:
     np.testing.assert_array_equal(start, problem.start)
     table = EstimatorSettings(tolerance=1e-9)
     solution, expected = (
-        solve_window(each, table) for each in (replace(problem, rows=found, start=start), problem)
+        solve_window(each, table) for each in (problem._replace(rows=found, start=start), problem)
     )
     np.testing.assert_allclose(solution.path, expected.path, rtol=0, atol=1e-12)
     np.testing.assert_allclose(solution.next_information, expected.next_information, rtol=1e-12)

@@ -15,7 +15,7 @@ from estimators.settings import EstimatorSettings
 from sim_bridge.studies.lockstep import run_lockstep
 from sim_bridge.studies.study_scenario import Scenario
 
-RELAY = EstimatorSettings(
+SHARED = EstimatorSettings(
     kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
 )
 DT = 0.1
@@ -33,7 +33,7 @@ def kalman_step(mean, covariance, accel, accel_variance, jacobian, noise, measur
 def test_on_a_linear_system_it_is_the_kalman_filter(window: int) -> None:
     # GIVEN one agent with position and velocity fixes: a linear system
     rng = np.random.default_rng(window)
-    settings = msgspec.structs.replace(RELAY, window=window, tolerance=1e-12)
+    settings = msgspec.structs.replace(SHARED, window=window, tolerance=1e-12)
     prior = np.diag([4.0, 4.0, 9.0, 1.0, 1.0, 2.0])
     estimator = make_estimator(settings, Layout((1,)), 0, np.zeros(6), prior, DT)
     noise, accel_variance = np.array([0.04, 0.04, 0.09, 0.01, 0.01, 0.02]), np.full(3, 0.3)
@@ -61,7 +61,7 @@ def test_rows_that_come_late_are_as_good_as_in_time() -> None:
     # GIVEN two agents' worth of fixes, one estimator with all in time, one with agent 2's two ticks late
     def fly(late: int) -> np.ndarray:
         rng = np.random.default_rng(4)
-        estimator = make_estimator(RELAY, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
+        estimator = make_estimator(SHARED, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
         waiting = []
         for tick in range(12):
             own = position_rows(tick, 0, rng.normal(size=3), np.full(3, 0.1))
@@ -77,7 +77,7 @@ def test_rows_that_come_late_are_as_good_as_in_time() -> None:
 
 
 def test_a_lost_agent_grows_uncertain_and_old_and_a_neighbours_pair_brings_it_back() -> None:
-    estimator = make_estimator(RELAY, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
+    estimator = make_estimator(SHARED, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
     for tick in range(30):
         estimator.begin(tick, position_rows(tick, 0, np.zeros(3), np.full(3, 0.01)), empty_inputs())
         estimate = estimator.solve()
@@ -94,11 +94,11 @@ def test_a_lost_agent_grows_uncertain_and_old_and_a_neighbours_pair_brings_it_ba
     found = estimator.solve()
     # THEN it is known here too, and the own block is no worse
     assert np.trace(found.covariance[6:9, 6:9]) < 0.5 * lost
-    assert found.age_ticks[1] <= RELAY.window
+    assert found.age_ticks[1] <= SHARED.window
 
 
 def test_a_pair_of_another_window_start_is_not_used() -> None:
-    estimator = make_estimator(RELAY, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
+    estimator = make_estimator(SHARED, Layout((1, 2)), 0, np.zeros(12), np.eye(12), DT)
     for tick in range(2):
         estimator.begin(tick, empty_rows(), empty_inputs())
         own = estimator.outgoing(0)
@@ -123,6 +123,6 @@ def test_it_is_consistent_and_near_the_centralised_filter_on_the_papers_fleet() 
             consistency.append(result.nees_full[41:].mean())
         return float(np.mean(errors)), float(np.mean(consistency))
 
-    relay, anees = steady(RELAY)
-    assert relay < 1.1 * steady(central)[0]
+    error_m, anees = steady(SHARED)
+    assert error_m < 1.1 * steady(central)[0]
     assert 0.7 < anees < 1.6

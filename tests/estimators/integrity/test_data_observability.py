@@ -16,7 +16,7 @@ from estimators.model.measurements import RowTable, empty_inputs, empty_rows, in
 from estimators.model.members import MemberChange
 from estimators.settings import EstimatorSettings
 
-RELAY = EstimatorSettings(
+SHARED = EstimatorSettings(
     kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
 )
 PLACES = np.array([[0.0, 0.0, -5.0], [9.0, 1.0, 0.0], [-6.0, 7.0, 0.0], [-5.0, -8.0, 1.0], [1.0, 0.0, -14.0]])
@@ -32,7 +32,7 @@ def hover(
     """
     rng = np.random.default_rng(0)
     mean = np.concatenate([PLACES, np.zeros((5, 3))], axis=1).ravel()
-    estimator = make_estimator(RELAY, Layout((1, 2, 3, 4, 5)), 0, mean, sure * np.eye(30), DT)
+    estimator = make_estimator(SHARED, Layout((1, 2, 3, 4, 5)), 0, mean, sure * np.eye(30), DT)
     estimates = []
     for tick in range(ticks):
         rows: list[RowTable] = [empty_rows()]

@@ -23,7 +23,7 @@ from estimators.model.measurements import RowTable, empty_inputs, empty_rows, po
 from estimators.settings import EstimatorSettings
 
 DT = 0.1
-RELAY = EstimatorSettings(kind="dmhe_shared", rounds=0, window=4, other_accel_variance=0.01)
+SHARED = EstimatorSettings(kind="dmhe_shared", rounds=0, window=4, other_accel_variance=0.01)
 FIX_SIGMA_M = 2.0
 PLACES = np.array([[0, 0, 0], [12, 0, 1], [0, 12, -2], [-11, 3, 2.5], [2, -13, -1.5]], float)
 
@@ -221,7 +221,7 @@ def fly(start: np.ndarray, ticks: int, seed: int) -> list[Estimate]:
     rng = np.random.default_rng(seed)
     layout = Layout((1, 2, 3, 4, 5))
     covariance = np.kron(np.eye(5), np.diag([1.0, 1.0, 1.0, 0.01, 0.01, 0.01]))
-    estimator = make_estimator(RELAY, layout, 3, at_rest(start), covariance, DT)
+    estimator = make_estimator(SHARED, layout, 3, at_rest(start), covariance, DT)
     estimates = []
     for tick in range(ticks):
         estimator.begin(tick, rows_of(tick, rng), empty_inputs())
@@ -270,7 +270,7 @@ def test_fixes_that_err_alike_for_minutes_do_not_turn_a_fleet_around(seed: int) 
     # GIVEN four drones whose places are known well, and receivers that are off by as much as the fleet is thick
     rng = np.random.default_rng(seed)
     layout, places = Layout((1, 2, 3, 4)), PLACES[:4]
-    estimator = make_estimator(RELAY, layout, 0, at_rest(places), 0.01 * np.eye(24), DT)
+    estimator = make_estimator(SHARED, layout, 0, at_rest(places), 0.01 * np.eye(24), DT)
     wander = rng.normal(size=(4, 3)) * 2.0
     for tick in range(150):
         tables = [position_rows(tick, k, places[k] + wander[k], np.full(3, FIX_SIGMA_M**2)) for k in range(4)]

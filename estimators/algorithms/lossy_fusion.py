@@ -322,7 +322,8 @@ class LeaderFusion:
     def __init__(
         self, model: TargetModel, mean: Vector, covariance: Matrix, rule: Rule, *, feedback: bool
     ) -> None:
-        self._own = LocalFilter(model, mean, covariance)
+        self.own = LocalFilter(model, mean, covariance)
+        """Filter of the own measurements; with feedback it goes on from what was fused."""
         self._follower = AgeCompensation(model, mean, covariance)
         self._rule, self._feedback = rule, feedback
         self._step = -1
@@ -330,10 +331,10 @@ class LeaderFusion:
     def step(self, measured: Vector, packet: SentEstimate | None) -> tuple[Vector, Matrix]:
         """Take in the own position ``(3,)`` and what came of the follower; the joint estimate."""
         self._step += 1
-        own = self._own.step(measured)
+        own = self.own.step(measured)
         if packet is not None:
             self._follower.take(packet)
         mean, covariance = combine(own, self._follower.at(self._step), self._rule)
         if self._feedback:
-            self._own.mean, self._own.covariance = mean, covariance
+            self.own.mean, self.own.covariance = mean, covariance
         return mean, covariance

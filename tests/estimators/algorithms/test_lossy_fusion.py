@@ -108,7 +108,7 @@ def test_the_frozen_distributed_scheme(rule: Rule, name: str, feedback: bool) ->
             np.testing.assert_allclose(mean, expected[0][k], rtol=1e-9)
             compared += 1
         if feedback and rule is Rule.INTERSECTION:
-            leader._own.mean = expected[0][k]  # on from the reference's choice at a tie
+            leader.own.mean = expected[0][k]  # on from the reference's choice at a tie
     assert compared > 20
 
 

@@ -43,7 +43,7 @@ import pkgutil
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar, cast
+from typing import Any, Literal, Protocol, TypeVar, cast
 
 import llvmlite.binding
 import numba
@@ -149,6 +149,14 @@ def kernel(function: Function) -> Function:
     return cast(Function, numba.jit(**OPTIONS)(function))
 
 
+class _Plain(Protocol):
+    def __call__(self, made: Structure, /) -> Structure: ...
+
+
+plain = cast(_Plain, tuple)
+"""A `NamedTuple` as the plain tuple that an entry takes; for type checkers it is what it was."""
+
+
 def structure(made: type[Any], fields: str, **named: Any) -> Any:
     """What stands in an entry's signature for a `NamedTuple` of a module, as argument or as result.
 
@@ -156,11 +164,6 @@ def structure(made: type[Any], fields: str, **named: Any) -> Any:
     """
     named_tuple: Any = types.NamedTuple
     return named_tuple(_read(f"({fields},)", named), made)
-
-
-def plain(made: Structure) -> Structure:
-    """A `NamedTuple` as the plain tuple that an entry takes; for type checkers it is what it was."""
-    return cast(Structure, tuple(made))
 
 
 def _read(notation: str, named: Mapping[str, Any]) -> Any:

@@ -276,7 +276,8 @@ class Watching(Observer):
 async def test_observers_are_told_and_cannot_hurt(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
     # GIVEN a daemon with an observer that fails and one that does not
     failing, good = Watching(True), Watching(False)
-    daemon = Daemon(config_of(1, "security.mode=unsigned"), 1, make_estimator, Path(), (failing, good))
+    config = config_of(1, "security.mode=unsigned")
+    daemon = Daemon(config, 1, make_estimator, Path(), (failing, good))
     running = asyncio.create_task(daemon.run())
     await until(lambda: good.estimates > 5 and len(good.states) > 0, "estimates and a second")
     daemon.stop()
@@ -287,7 +288,7 @@ async def test_observers_are_told_and_cannot_hurt(config_of: Any, caplog: pytest
     assert good.states[-1].counters["program faults"] > 0
     assert "no metrics today" in caplog.text
     assert "no end either" in caplog.text
-    summary = json.loads(next(Path(str(daemon._config.record.directory)).glob("*.json")).read_text())
+    summary = json.loads(next(Path(str(config.record.directory)).glob("*.json")).read_text())
     assert summary["counters"]["record entries"] > 0
 
 

@@ -19,7 +19,7 @@ from estimators.settings import EstimatorSettings
 from estimators.solvers.constrained_kernels import (
     BoundPoint,
     LinearProgram,
-    Prepared,
+    PreparedWindow,
     evaluate,
     finish,
     linearise_bounds,
@@ -110,7 +110,7 @@ class _Outcome:
     active: int
 
 
-def _finished(problem: WindowProblem, prepared: Prepared, outcome: _Outcome) -> WindowSolution | None:
+def _finished(problem: WindowProblem, prepared: PreparedWindow, outcome: _Outcome) -> WindowSolution | None:
     n = len(problem.vector)
     path, information = np.empty((len(problem.accel) + 1, n)), np.empty((n, n))
     if not finish(plain(prepared.region), plain(prepared.window), outcome.z, plain(problem), path, information):

@@ -27,7 +27,7 @@ from estimators.window.regional import REGION, Region, gather, regional_problem
 from estimators.window.types import CORRECTED, OPTIONS, PROBLEM, StepOptions, WindowProblem
 
 
-class Prepared(NamedTuple):
+class PreparedWindow(NamedTuple):
     """A window ready for the constrained step."""
 
     region: Region
@@ -38,11 +38,11 @@ class Prepared(NamedTuple):
     """Whether that was reached."""
 
 
-PREPARED = structure(Prepared, "REGION, WINDOW, float64[::1], boolean", REGION=REGION, WINDOW=WINDOW)
+PREPARED_WINDOW = structure(PreparedWindow, "REGION, WINDOW, float64[::1], boolean", REGION=REGION, WINDOW=WINDOW)
 
 
-@entry("PREPARED(PROBLEM, OPTIONS, float64[::1])", PREPARED=PREPARED, PROBLEM=PROBLEM, OPTIONS=OPTIONS)
-def prepare(problem: WindowProblem, options: StepOptions, first_state: Vector) -> Prepared:
+@entry("PREPARED(PROBLEM, OPTIONS, float64[::1])", PREPARED=PREPARED_WINDOW, PROBLEM=PROBLEM, OPTIONS=OPTIONS)
+def prepare(problem: WindowProblem, options: StepOptions, first_state: Vector) -> PreparedWindow:
     """Reduce a window and give its unconstrained optimum.
 
     ``first_state`` ``(6n,)`` is that optimum's first state: all of z with pre-estimation, computed again
@@ -59,7 +59,7 @@ def prepare(problem: WindowProblem, options: StepOptions, first_state: Vector) -
         converged = True
     elif region.definite:
         converged = minimise(w, z, options.max_iterations, options.tolerance)[3]
-    return Prepared(region, w, z, converged)
+    return PreparedWindow(region, w, z, converged)
 
 
 @entry("float64(WINDOW, float64[::1], int64, float64[:, ::1], float64[::1])", WINDOW=WINDOW)

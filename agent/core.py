@@ -7,7 +7,9 @@ Tick k ends at E = (k+1) T and is worked off in this order:
 
 =============================  =================================================================
 by E + guard                   close the timeline; own records and input; measurement packet out
-by E + exchange                neighbours' packets of the tick in; `Estimator.begin`
+by E + exchange                neighbours' packets in; when all are there or their share of the time is
+                               over, the next exchange: a packet out with what the last one brought
+then                           `Estimator.begin`
 by E + exchange + rounds       L consensus rounds, each until complete or its share is over
 then                           `Estimator.solve`; estimate out
 =============================  =================================================================
@@ -45,6 +47,8 @@ from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurements, Record
 from transport.security.opening import Received
 
+USUAL_EXCHANGES = 2
+"""Packets of records in every tick; more of `transport.exchanges` only where records of earlier ticks are lacked."""
 MAX_BEHIND_TICKS = 50
 """Further behind (a suspended computer, a clock set forward), the ticks between are left out."""
 
@@ -90,6 +94,9 @@ class AgentCore:
         self._end_s = self._close_s = self._packets_by_s = -math.inf
         """When the tick ends, is closed, and goes on without packets that are missing; set with the tick."""
         self._round = 0
+        self._exchange = 0
+        self._clock_s = -math.inf
+        """When `advance` was called last."""
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -163,11 +170,11 @@ class AgentCore:
 
     def _on_measurements(self, sender: int, message: Measurements) -> None:
         assert self._tick is not None
-        self.neighbours.on_measurements(sender, message.tick)
+        self.neighbours.on_measurements(sender, message.tick, message.exchange)
         self.records.neighbourhood.hear(sender, self._tick)
         if message.tick < self._tick or (message.tick == self._tick and self._phase is _Phase.ROUND):
             self.counters["measurements: late"] += 1
-        for record in self.records.add_heard(message.records, self._tick):
+        for record in self.records.add_heard(sender, message.records, self._tick):
             self.fleet.note(record, self._tick)
 
     def _on_information(self, sender: int, message: Information, now_s: float) -> None:
@@ -187,14 +194,14 @@ class AgentCore:
             return None
         if self._phase is _Phase.END:
             return self._close_s
-        return self._packets_by_s if self._phase is _Phase.PACKETS else self._barrier.deadline_s
+        return self._packets_due_s() if self._phase is _Phase.PACKETS else self._barrier.deadline_s
 
     def advance(self, now_s: float, link_state: str) -> list[CoreOutput]:
         """Do what is due; call it when `next_due_s` has come and after anything came in.
 
         ``link_state`` says how the autopilot's link is, for the health.
         """
-        self._link_state = link_state
+        self._link_state, self._clock_s = link_state, now_s
         outputs: list[CoreOutput] = []
         if self._tick is None:
             self._enter(tick_of(now_s, self._period_s))
@@ -224,11 +231,9 @@ class AgentCore:
         if self._phase is _Phase.END:
             if now_s < self._close_s:
                 return False
-            self._close_tick(outputs)
+            self._close_tick(now_s, outputs)
         elif self._phase is _Phase.PACKETS:
-            if now_s < self._packets_by_s and not self.neighbours.all_measured(self._tick, now_s):
-                return False
-            self._begin(now_s, outputs)
+            return self._exchange_or_begin(now_s, outputs)
         else:
             if not self._barrier.done(now_s):
                 return False
@@ -243,13 +248,57 @@ class AgentCore:
         self._packets_by_s = self._end_s + self._config.transport.exchange_fraction * self._period_s
         self._barrier.advance(tick)
 
-    def _close_tick(self, outputs: list[CoreOutput]) -> None:
+    def _close_tick(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
         self._input = self.timeline.close(self._tick)
         self.gps_latency.on_tick(self._input)
         self._on_own_record(acceleration_record(self._agent_id, self._input))
-        outputs.append(Tell(self.records.packet(self._tick)))
+        self._tell_records(0, now_s, outputs)
         self._phase = _Phase.PACKETS
+
+    def _exchange_or_begin(self, now_s: float, outputs: list[CoreOutput]) -> bool:
+        """The next packet of records if it is due, or the estimate if no more is to come; whether either was.
+
+        The second packet takes what the first ones brought a hop further; those after it repair what was lost.
+        """
+        assert self._tick is not None
+        usual = min(USUAL_EXCHANGES, self._config.transport.exchanges)
+        if self._exchange + 1 < usual:
+            if now_s < self._exchange_by_s() and not self.neighbours.all_measured(self._tick, self._exchange, now_s):
+                return False
+            self._tell_records(self._exchange + 1, now_s, outputs)
+        elif self._repairs(now_s) and now_s >= self._exchange_by_s():
+            self._tell_records(self._exchange + 1, now_s, outputs)
+        elif now_s >= self._packets_by_s or (
+            not self._repairs(now_s) and self.neighbours.all_measured(self._tick, usual - 1, now_s)
+        ):
+            self._begin(now_s, outputs)
+        else:
+            return False
+        return True
+
+    def _tell_records(self, exchange: int, now_s: float, outputs: list[CoreOutput]) -> None:
+        assert self._tick is not None
+        self._exchange = exchange
+        outputs.append(Tell(self.records.packet(self._tick, exchange, self.neighbours.heard(now_s))))
+
+    def _repairs(self, now_s: float) -> bool:
+        """Whether another packet of this tick is to repair what earlier ticks' packets have not brought."""
+        if self._exchange + 1 >= self._config.transport.exchanges:
+            return False
+        assert self._tick is not None
+        return self.records.lacked(self._tick, self.neighbours.heard(now_s))
+
+    def _exchange_by_s(self) -> float:
+        """When the exchange under way ends at the latest."""
+        share = (self._exchange + 1) / self._config.transport.exchanges
+        return self._close_s + share * (self._packets_by_s - self._close_s)
+
+    def _packets_due_s(self) -> float:
+        """When there is something to do while packets are waited for."""
+        if self._exchange + 1 < self._config.transport.exchanges and self._clock_s < self._exchange_by_s():
+            return self._exchange_by_s()
+        return self._packets_by_s
 
     def _begin(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None

@@ -19,7 +19,7 @@ from agent.config.checks import faults_between
 from agent.config.documents import SET, Document, Override, read_document
 from agent.config.faults import Fault, one_of, probably
 from agent.config.other_tables import READ_BY_OTHERS, OtherTables
-from agent.config.retired import explained, without_retired
+from agent.config.retired import as_flown, explained
 from agent.config.structs import keys_of, read_struct
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
@@ -65,7 +65,7 @@ def recorded_config(text: str, where: str, flown_with: str, overrides: Iterable[
     Raises `ConfigError`, for a former key with another value than the present constant naming that software.
     """
     try:
-        tables, faults = without_retired(tomllib.loads(text))
+        tables, faults = as_flown(tomllib.loads(text))
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(where, "", "valid TOML", str(error)) from error
     if faults:

@@ -1,4 +1,4 @@
-"""Keys that are no longer keys: what each is now, and the old files that still have them.
+"""Keys that are no longer keys, or were not always: what each is now, and the old files that still have them.
 
 Nobody set them, so each is a constant beside the code that uses it. A fleet's file that has one is refused with what
 took its place. Old flight logs hold the whole configuration that they were flown with, these keys too: there they are
@@ -53,6 +53,10 @@ RETIRED: Mapping[str, Retired] = {
 }
 
 
+LATER: Mapping[str, object] = {"transport.exchanges": 1}
+"""Keys that came later, and what was so before them: a flight log without such a key was flown like that."""
+
+
 def explained(fault: Fault) -> Fault:
     """A fault of an unknown key, saying what took its place if it was a key once."""
     retired = RETIRED.get(re.sub(r"\[\d+\]", "", fault.key))
@@ -61,8 +65,8 @@ def explained(fault: Fault) -> Fault:
     return replace(fault, meant="", says=f"no longer a key: {retired.words}; remove the line")
 
 
-def without_retired(tables: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
-    """Tables of an old file without the former keys, and those of them whose value can be had no longer."""
+def as_flown(tables: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]]:
+    """The configuration of an old flight in today's keys, and the former keys whose value can be had no longer."""
     kept, faults = copy.deepcopy(tables), []
     for key, retired in RETIRED.items():
         table, _, name = key.partition(".")
@@ -72,4 +76,7 @@ def without_retired(tables: dict[str, Any]) -> tuple[dict[str, Any], list[Fault]
         value = inside.pop(name)
         if value != retired.value:
             faults.append(Fault(key, "", "", says=f"{value} was set, and it is no longer a key: {retired.words}"))
+    for key, before in LATER.items():
+        table, _, name = key.partition(".")
+        kept.setdefault(table, {}).setdefault(name, before)
     return kept, faults

@@ -180,8 +180,11 @@ class TransportTable(Table, frozen=True):
     """Share of the period, from the tick's end, after which measurement packets of a tick count as late."""
     rounds_fraction: Fraction = 0.4
     """Share of the period that all consensus rounds together may take."""
-    history_ticks: Annotated[int, msgspec.Meta(ge=1, le=20)] = 4
-    """Ticks of own records in each measurement packet, so that one packet repairs earlier losses."""
+    exchanges: Annotated[int, msgspec.Meta(ge=1, le=4)] = 4
+    """Measurement packets per tick, at most. The second takes what the first ones brought a hop further at once;
+    those after it are sent while a neighbour may lack a record of an earlier tick."""
+    history_ticks: Annotated[int, msgspec.Meta(ge=1, le=64)] = 7
+    """For how many ticks a record is sent again while a neighbour may lack it."""
     neighbour_timeout_s: Positive = 2.0
     """A neighbour silent for longer is not waited for."""
     loss: Fraction = 0.0

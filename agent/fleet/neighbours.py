@@ -12,7 +12,8 @@ from agent.config.tables import FleetConfig
 class _Neighbour:
     heard_s: float = -math.inf
     informed_s: float = -math.inf
-    measured_tick: int = -1
+    measured: tuple[int, int] = (-1, 0)
+    """Latest tick and exchange that its measurements came of."""
     left_s: float = -math.inf
     """When one that has left was heard last."""
 
@@ -37,10 +38,10 @@ class NeighbourTable:
         """Something came from a neighbour."""
         self._table[agent_id].heard_s = now_s
 
-    def on_measurements(self, agent_id: int, tick: int) -> None:
-        """A neighbour's measurements up to a tick came."""
+    def on_measurements(self, agent_id: int, tick: int, exchange: int) -> None:
+        """A neighbour's measurements up to a tick came, in its packet of an exchange."""
         neighbour = self._table[agent_id]
-        neighbour.measured_tick = max(neighbour.measured_tick, tick)
+        neighbour.measured = max(neighbour.measured, (tick, exchange))
 
     def on_information(self, agent_id: int, now_s: float) -> None:
         """A neighbour takes part in the rounds."""
@@ -49,14 +50,18 @@ class NeighbourTable:
     def on_gone(self, agent_id: int) -> None:
         """A neighbour has left; what it has sent stands."""
         known = self._table[agent_id]
-        self._table[agent_id] = _Neighbour(measured_tick=known.measured_tick, left_s=max(known.heard_s, known.left_s))
+        self._table[agent_id] = _Neighbour(measured=known.measured, left_s=max(known.heard_s, known.left_s))
 
-    def all_measured(self, tick: int, now_s: float) -> bool:
-        """Whether every neighbour that is heard has sent its measurements of a tick."""
+    def all_measured(self, tick: int, exchange: int, now_s: float) -> bool:
+        """Whether every neighbour that is heard has sent its measurements of a tick's exchange."""
         for neighbour in self._table.values():
-            if neighbour.measured_tick < tick and self._is_recent(neighbour.heard_s, now_s):
+            if neighbour.measured < (tick, exchange) and self._is_recent(neighbour.heard_s, now_s):
                 return False
         return True
+
+    def heard(self, now_s: float) -> frozenset[int]:
+        """Neighbours that are heard."""
+        return frozenset(a for a, n in self._table.items() if self._is_recent(n.heard_s, now_s))
 
     def informing(self, now_s: float) -> frozenset[int]:
         """Neighbours whose information a round waits for."""

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container, Iterable, Sequence
+from collections.abc import Collection, Container, Iterable, Sequence
+from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
 from agent.fleet.records import inputs_of, rows_of
@@ -77,8 +78,20 @@ class Neighbourhood:
         return hops is not None and hops <= limit
 
 
+@dataclass(slots=True)
+class _OnItsWay:
+    """A record that is sent on, and the neighbours that are known to have it: it was in their packets."""
+
+    record: Record
+    held_by: set[int] = field(default_factory=set)
+
+
 class RecordStore:
-    """Records by tick, own and heard; ``refused`` counts those not taken, by reason."""
+    """Records by tick, own and heard; ``refused`` counts those not taken, by reason.
+
+    A packet brings first what some neighbour may lack: a record that was in a neighbour's packet is one that it has.
+    So that neighbours know it of us, what came in since the last packet goes out again behind that, as an echo.
+    """
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
         self._agent_id = agent_id
@@ -87,10 +100,10 @@ class RecordStore:
         self.neighbourhood = Neighbourhood(config, agent_id)
         self._seen: dict[int, dict[object, Record]] = {}
         """The records taken in, by tick and identity."""
-        self._known: set[int] = set()
-        """``id`` of these objects: where packets are handed over as objects, most come again."""
-        self._to_send: dict[int, tuple[list[Record], list[Record]]] = {}
-        """Own and relayed records by tick."""
+        self._to_send: dict[int, tuple[dict[object, _OnItsWay], dict[object, _OnItsWay]]] = {}
+        """Own and relayed records by tick, each by its identity."""
+        self._echoes: dict[object, Record] = {}
+        """What was heard since the last packet, by its identity."""
         self._rows: list[Record] = []
         self._inputs: list[AccelerationRecord] = []
         self.refused: Counter[str] = Counter()
@@ -102,12 +115,25 @@ class RecordStore:
         except EncodeError:
             self.refused["own: out of range"] += 1
             return None
-        return rounded if self._add(rounded) else None
+        return rounded if self._add(rounded, identity(rounded)) else None
 
-    def add_heard(self, records: Iterable[Record], tick: int) -> list[Record]:
+    def add_heard(self, sender: int, records: Iterable[Record], tick: int) -> list[Record]:
         """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
-        fresh = [record for record in records if id(record) not in self._known]
-        return [record for record in fresh if self._wanted(record, tick) and self._add(record)]
+        taken = []
+        for record in records:
+            if self._wanted(record, tick):
+                name = identity(record)
+                self._echoes[name] = record
+                if self._add(record, name):
+                    taken.append(record)
+            self._note_holder(sender, record)
+        return taken
+
+    def _note_holder(self, sender: int, record: Record) -> None:
+        for part in self._to_send.get(record.tick, ()):
+            sent = part.get(identity(record))
+            if sent is not None:
+                sent.held_by.add(sender)
 
     def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
         """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
@@ -140,16 +166,32 @@ class RecordStore:
         self._rows = waiting
         self._inputs = [record for record in self._inputs if record.tick >= first]
         for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
-            self._known.difference_update(map(id, self._seen.pop(old).values()))
+            self._seen.pop(old)
             self._to_send.pop(old, None)
 
-    def packet(self, tick: int) -> Measurements:
-        """What neighbours get at a tick: the records of the last ticks, our own before relayed ones."""
-        records: list[Record] = []
+    def packet(self, tick: int, exchange: int, neighbours: Collection[int]) -> Measurements:
+        """What ``neighbours`` get in an exchange: what one of them may lack, newest first, then echoes.
+
+        While nobody is heard all of the last ticks goes out.
+        """
+        lacked: dict[object, Record] = {}
         for of_tick in range(tick, tick - self._history_ticks, -1):
             for part in self._to_send.get(of_tick, ()):
-                records += part
-        return Measurements(tick, tuple(records))
+                for name, sent in part.items():
+                    if not neighbours or not sent.held_by.issuperset(neighbours):
+                        lacked[name] = sent.record
+        echoes = sorted(self._echoes.items(), key=lambda item: -item[1].tick)
+        lacked.update((name, record) for name, record in echoes if name not in lacked)
+        self._echoes = {}
+        return Measurements(tick, tuple(lacked.values()), exchange)
+
+    def lacked(self, tick: int, neighbours: Collection[int]) -> bool:
+        """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get."""
+        for of_tick in range(tick - 1, tick - self._history_ticks, -1):
+            for part in self._to_send.get(of_tick, ()):
+                if not all(sent.held_by.issuperset(neighbours) for sent in part.values()):
+                    return True
+        return False
 
     def _wanted(self, record: Record, tick: int) -> bool:
         """Whether a record that a neighbour sent is one to take in, if it is new."""
@@ -166,16 +208,15 @@ class RecordStore:
             return False
         return True
 
-    def _add(self, record: Record) -> bool:
-        """Take in a record; false if it is there already."""
-        seen, name = self._seen.setdefault(record.tick, {}), identity(record)
+    def _add(self, record: Record, name: object) -> bool:
+        """Take in a record by its identity; false if it is there already."""
+        seen = self._seen.setdefault(record.tick, {})
         if name in seen:
             return False
         seen[name] = record
-        self._known.add(id(record))
         if self.neighbourhood.sends(record):
-            own, relayed = self._to_send.setdefault(record.tick, ([], []))
-            (own if record.observer == self._agent_id else relayed).append(record)
+            own, relayed = self._to_send.setdefault(record.tick, ({}, {}))
+            (own if record.observer == self._agent_id else relayed)[name] = _OnItsWay(record)
         if isinstance(record, AccelerationRecord):
             self._inputs.append(record)
         else:

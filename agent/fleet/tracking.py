@@ -75,6 +75,11 @@ class FleetTracker:
         """Whether there is an estimate, or was one to go on from."""
         return self._estimator is not None or self._good is not None
 
+    @property
+    def dropped(self) -> int:
+        """Rows and inputs that came too late for the estimator's window."""
+        return 0 if self._estimator is None else self._estimator.dropped
+
     def note(self, record: Record, tick: int) -> None:
         """A record, own or heard, at the current tick."""
         self.roll.note(record, tick)

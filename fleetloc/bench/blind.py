@@ -66,8 +66,8 @@ def blind(
         for case, each in zip(cases, flown, strict=True)
     }
     print_table(
-        ["case | method", "ranges", "goal m", "median m", "90 % m", "ANEES own", "ANEES fleet", "runs > 3 sigma",
-         "flagged of them", "flagged of the others"],
+        ["case | method", "ranges", "goal m", "median m", "90 % m", "availability", "ANEES own",
+         "ANEES fleet", "runs > 3 sigma", "flagged of them", "flagged of the others"],
         [_line(case, name, row) for case in cases for name, row in rows[case.name].items()],
         title=f"The blind drone's own position, {runs} runs, t = {FIRST}..{SAMPLES}",
     )  # fmt: skip
@@ -87,7 +87,10 @@ def blind_row(sample: Sample) -> dict[str, float | int]:
     all_errors = np.concatenate([each[FIRST:, -1] for each in sample.own_position])
     own, own_se = mean_and_error([float(each[FIRST:, -1].mean()) for each in sample.nees_own])
     full, full_se = mean_and_error([float(each[FIRST:].mean()) for each in sample.nees_full])
-    return {
+    served: dict[str, float | int] = {}
+    if sample.available:
+        served["availability"] = float(np.mean([each[FIRST:, -1].mean() for each in sample.available]))
+    return served | {
         "own_position_median_m": float(np.median(all_errors)),
         "own_position_p90_m": float(np.quantile(all_errors, 0.9)),
         "anees_own_mean": own,
@@ -113,6 +116,7 @@ def _line(case: BlindCase, method: str, row: Mapping[str, float | int]) -> list[
         "-" if case.goal_m is None else f"{case.goal_m:g}",
         f"{row['own_position_median_m']:.3f}",
         f"{row['own_position_p90_m']:.3f}",
+        f"{row['availability']:.4f}" if "availability" in row else "-",
         f"{row['anees_own_mean']:.2f}",
         f"{row['anees_full_mean']:.2f}",
         f"{wrong} of {row['runs']}",

@@ -2,80 +2,41 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from fleetloc.bench.methods import FLAGSHIP, GENIE
 from fleetloc.bench.plots import curves, save
 from fleetloc.bench.sweep import STEADY_FROM, Flown, Point, fly, numbered, show
 from fleetloc.output import print_table, with_error
-from sim_bridge.studies.link_conditions import (
-    with_bursts,
-    with_delay,
-    with_duplicates,
-    with_fu_channel,
-    with_loss,
-    with_one_way,
-)
+from sim_bridge.studies.air import Air, bursty, fu_channel, lossy
 from sim_bridge.studies.monte_carlo import Method
-from sim_bridge.studies.recording import Recording
 from sim_bridge.studies.study_scenario import Scenario
+from transport.link.channel import LinkFaults
 
-Rng = np.random.Generator
-
-
-def lossy(recording: Recording, rng: Rng, *, probability: float) -> Recording:
-    """Bernoulli loss on every directed link."""
-    return with_loss(recording, probability, rng)
-
-
-def late(recording: Recording, _rng: Rng, *, ticks: int) -> Recording:
-    """Every packet by as much too late."""
-    return with_delay(recording, ticks)
-
-
-def _bursts(recording: Recording, rng: Rng) -> Recording:
-    return with_bursts(recording, 0.3, 5.0, rng)
-
-
-def _jitter(recording: Recording, rng: Rng) -> Recording:
-    return with_delay(recording, 0, 3, rng)
-
-
-def _duplicates(recording: Recording, rng: Rng) -> Recording:
-    return with_duplicates(recording, 0.5, rng)
-
-
-def _one_way(recording: Recording, _rng: Rng) -> Recording:
-    return with_one_way(recording, receiver=0, sender=1)
-
-
-CHANNELS: dict[str, tuple[str, Callable[[Recording, Rng], Recording], str]] = {
-    "bursts": ("bursts: loss 0.3, 5 ticks on average (Gilbert-Elliott)", _bursts, "line"),
-    "jitter": ("delay random, 0 to 3 ticks: packets overtake each other", _jitter, "line"),
-    "duplicates": ("every other packet twice", _duplicates, "line"),
-    "one-way": ("triangle, 1 does not hear 2", _one_way, "triangle"),
-    "fu": ("on time 0.4, a tick late 0.3, lost 0.3 (Fu, Bi, Gao)", with_fu_channel, "line"),
+CHANNELS: dict[str, tuple[str, Air, str]] = {
+    "bursts": ("bursts: loss 0.3, 20 packets on average (Gilbert-Elliott)", bursty(0.3, 20.0), "line"),
+    "jitter": ("delay random, 0 to 3 ticks: packets overtake each other", Air(spread_ticks=3.0), "line"),
+    "duplicates": ("every other packet twice", Air(LinkFaults(duplicate=0.5), spread_ticks=1.0), "line"),
+    "one-way": ("triangle, 1 does not hear 2", Air(deaf=((0, 1),)), "triangle"),
+    "fu": ("on time 0.4, a tick late 0.3, lost 0.3 (Fu, Bi, Gao)", fu_channel(), "line"),
 }
-"""Name -> what it is, the link, the graph it is flown on."""
+"""Name -> what it is, the radio, the graph it is flown on."""
 
 
 def points(losses: Sequence[float], delays_ticks: Sequence[int], channels: Sequence[str]) -> list[Point]:
     """The conditions of the study; lossless is the reference of each axis and always there."""
     line = Scenario()
     found = [Point("loss 0", "loss", 0.0, line, None, is_reference=True)]
-    found += [Point(f"loss {p:g}", "loss", p, line, partial(lossy, probability=p)) for p in losses if p]
+    found += [Point(f"loss {p:g}", "loss", p, line, lossy(p)) for p in losses if p]
     ticks = [d for d in delays_ticks if d]
     if ticks:
         found.append(Point("delay 0 ticks", "delay_ticks", 0.0, line, None, is_reference=True))
-    found += [Point(f"delay {d} ticks", "delay_ticks", float(d), line, partial(late, ticks=d)) for d in ticks]
+    found += [Point(f"delay {d} ticks", "delay_ticks", float(d), line, Air(delay_ticks=d)) for d in ticks]
     for name in channels:
-        what, link, graph = CHANNELS[name]
-        found.append(Point(what, f"channel {name}", None, Scenario(graph), link))
+        what, air, graph = CHANNELS[name]
+        found.append(Point(what, f"channel {name}", None, Scenario(graph), air))
     return found
 
 
@@ -89,7 +50,7 @@ def loss(
     if GENIE in methods and FLAGSHIP in methods:
         _beside_the_genie(flown)
     if out is not None:
-        for axis, label in (("loss", "probability of loss per link and tick"), ("delay_ticks", "delay, ticks")):
+        for axis, label in (("loss", "probability that a packet is lost"), ("delay_ticks", "delay, ticks")):
             along = numbered(flown, axis)
             if len(along) > 1:
                 save(curves(along, label), out, axis)
@@ -112,5 +73,5 @@ def _beside_the_genie(flown: Sequence[Flown]) -> None:
             for each in flown
             for rows in [(each.rows[FLAGSHIP], each.rows[GENIE])]
         ],
-        title="Beside the genie: full information on all records that could have arrived",
+        title="Beside the genie of the flown exchange: full information on all records that could have arrived",
     )

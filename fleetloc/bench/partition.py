@@ -7,7 +7,7 @@ members of a mesh solve one and the same problem, and what they disagree by is r
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 from estimators.settings import EstimatorSettings
 from fleetloc.bench.plots import islands, save
 from fleetloc.output import print_table, progress_bar
-from sim_bridge.studies.link_conditions import with_loss, with_partition
-from sim_bridge.studies.lockstep import run_lockstep
-from sim_bridge.studies.monte_carlo import LINK_STREAM, Hangar
+from sim_bridge.studies.air import Air, channel_seed
+from sim_bridge.studies.flown import fly_recording
+from sim_bridge.studies.monte_carlo import Hangar
 from sim_bridge.studies.recording import Recording
 from sim_bridge.studies.study_scenario import Scenario
+from transport.link.channel import LinkFaults
 
 Floats = NDArray[np.float64]
 
@@ -55,12 +56,20 @@ class Plan:
         """First tick of the partition, first after it."""
         return round(self.begin_s / self.period_s), round((self.begin_s + self.length_s) / self.period_s)
 
-    def recording(self, run: int) -> Recording:
-        """A run without the cut."""
+    def recording(self, run: int, *, cut: bool) -> Recording:
+        """What is measured in a run; with the cut no ranges between the islands, if they are out of sight."""
         ticks = self.cut[1] + round(self.after_s / self.period_s)
-        scenario = Scenario(self.graph, ticks, self.period_s, turn_every_s=self.turn_every_s)
-        links = np.random.default_rng([self.seed, run, LINK_STREAM])
-        return with_loss(scenario.record(self.seed, run), self.loss, links)
+        recording = Scenario(self.graph, ticks, self.period_s, turn_every_s=self.turn_every_s).record(self.seed, run)
+        if not (cut and self.ranges_cut):
+            return recording
+        inside = np.isin(np.arange(len(recording.agents)), self.island)
+        ranges = recording.ranges.copy()
+        ranges[slice(*self.cut), inside[:, None] != inside[None, :]] = np.nan
+        return replace(recording, ranges=ranges)
+
+    def air(self, *, cut: bool) -> Air:
+        """The radio of a run."""
+        return Air(LinkFaults(loss=self.loss), cut=(self.island, *self.cut) if cut else None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,13 +84,16 @@ class Outcome:
     error: Floats
     """Mean norm of the fleet-state error of all members."""
     clean_error: Floats
+    available: float
+    """Share of ticks with an estimate in time, of the run with the cut."""
 
 
 def fly_once(plan: Plan, run: int) -> Outcome:
     """One run with the partition and without."""
-    whole = plan.recording(run)
-    cut = with_partition(whole, plan.island, *plan.cut, ranges=plan.ranges_cut)
-    clean, parted = run_lockstep(whole, plan.settings), run_lockstep(cut, plan.settings)
+    whole, seed = plan.recording(run, cut=False), channel_seed(plan.seed, run)
+    flown_whole = fly_recording(whole, plan.settings, plan.air(cut=False), seed=seed)
+    flown_cut = fly_recording(plan.recording(run, cut=True), plan.settings, plan.air(cut=True), seed=seed)
+    clean, parted = flown_whole.estimates, flown_cut.estimates
     assert parted.nees_full is not None
     assert whole.truth is not None
     truth = whole.truth.reshape(len(whole.truth), 1, -1)
@@ -93,6 +105,7 @@ def fly_once(plan: Plan, run: int) -> Outcome:
         between(clean.mean, ins, outs),
         np.linalg.norm(parted.mean - truth, axis=-1).mean(axis=1),
         np.linalg.norm(clean.mean - truth, axis=-1).mean(axis=1),
+        float(flown_cut.available.mean()),
     )
 
 
@@ -143,6 +156,7 @@ def figures(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
         "loss": plan.loss,
         "ranges_cut": plan.ranges_cut,
         "turn_every_s": plan.turn_every_s,
+        "availability": float(np.mean([outcome.available for outcome in outcomes])),
     }
     for name, line in anees.items():
         during = line[first:]

@@ -9,7 +9,8 @@ from typing import Any
 
 from fleetloc.bench.methods import CENTRALISED
 from fleetloc.output import print_table, progress_bar, with_error
-from sim_bridge.studies.monte_carlo import Hangar, Link, Method, Sample, accuracy_row, ratio_of_means, run_study
+from sim_bridge.studies.air import Air
+from sim_bridge.studies.monte_carlo import Hangar, Method, Sample, accuracy_row, ratio_of_means, run_study
 from sim_bridge.studies.study_scenario import Scenario
 
 STEADY_FROM = 41
@@ -26,7 +27,7 @@ class Point:
     axis: str
     value: float | None
     scenario: Scenario
-    link: Link | None = None
+    air: Air | None = None
     is_reference: bool = False
     """The other points of its axis are compared with it, run by run."""
 
@@ -60,7 +61,7 @@ def fly(
     with Hangar(min(jobs, runs)) as hangar, progress_bar("runs", runs * len(methods) * len(points)) as advance:
         for point in points:
             samples = run_study(
-                point.scenario, methods, runs, seed, advance, point.link, link_seed=link_seed, hangar=hangar
+                point.scenario, methods, runs, seed, advance, point.air, link_seed=link_seed, hangar=hangar
             )
             last = point.scenario.samples
             rows = {name: accuracy_row(sample, steady_from(last), last) for name, sample in samples.items()}
@@ -102,10 +103,21 @@ def show(flown: Sequence[Flown], title: str) -> None:
         ["steady ANEES | ratio to centralised | to reference", *methods],
         [[each.point.name, *(_ratios(each.rows[name]) for name in methods)] for each in flown],
     )
+    print_table(
+        ["availability | kB/s that a drone sends", *methods],
+        [[each.point.name, *(_served(each.rows[name]) for name in methods)] for each in flown],
+    )
 
 
 def _error(row: Mapping[str, float | int]) -> str:
     return with_error(row["norm_full_steady_mean"], row["norm_full_steady_mean_se"])
+
+
+def _served(row: Mapping[str, float | int]) -> str:
+    """Share of steady ticks with an estimate in time, and what it took; nothing of a method that does not fly."""
+    if "availability_steady" not in row:
+        return "-"
+    return f"{row['availability_steady']:.4f} | {row['sent_all_bytes_per_s'] / 1e3:.1f}"
 
 
 def _ratios(row: Mapping[str, float | int]) -> str:

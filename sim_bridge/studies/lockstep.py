@@ -1,4 +1,8 @@
-"""A fleet of estimators over a recording, tick by tick in virtual time."""
+"""A fleet of estimators over a recording, tick by tick, with a model of the exchange (`sim_bridge.studies.relay`).
+
+For study inputs that say which packets arrive, and for the paper's estimators as the paper runs them; published
+figures come from the agents that fly (`sim_bridge.studies.flown`).
+"""
 
 from __future__ import annotations
 

@@ -15,19 +15,17 @@ from numpy.typing import NDArray
 from estimators.estimator import Status
 from estimators.model.layout import block, position, velocity
 from estimators.settings import EstimatorSettings
+from sim_bridge.studies.air import Air, channel_seed
+from sim_bridge.studies.flown import FlownResult, fly_recording
 from sim_bridge.studies.genie import Genie
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
 from sim_bridge.studies.recording import Recording
 from sim_bridge.studies.study_scenario import Scenario
 
 Floats = NDArray[np.float64]
-Link = Callable[[Recording, np.random.Generator], Recording]
 Method = EstimatorSettings | Genie
 Given = TypeVar("Given")
 Found = TypeVar("Found")
-
-LINK_STREAM = 7
-"""Keeps the links' random draws apart from the flight's."""
 
 
 @dataclass(slots=True)
@@ -46,6 +44,10 @@ class Sample:
     nees_own: list[Floats] = field(default_factory=list)
     step_cpu_s: list[float] = field(default_factory=list)
     """CPU time per agent and tick of each run, everything included."""
+    available: list[NDArray[np.bool_]] = field(default_factory=list)
+    """Whether an estimate was out within a period of its tick's end ``(T+1, n)``; of flown runs only."""
+    bytes_per_s: list[dict[str, float]] = field(default_factory=list)
+    """What a drone put on the air, by kind of message and in all; of flown runs only."""
     not_converged: int = 0
     fell_back: int = 0
     own_sigma: list[Floats] = field(default_factory=list)
@@ -57,6 +59,12 @@ class Sample:
         """Append the runs of another sample."""
         for each in fields(self):
             setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
+
+    def add_flown(self, recording: Recording, flown: FlownResult, cpu_s: float) -> None:
+        """Add a run of the agents that fly."""
+        self.add(recording, flown.estimates, cpu_s)
+        self.available.append(flown.available)
+        self.bytes_per_s.append(flown.bytes_per_s)
 
     def add(self, recording: Recording, result: LockstepResult, cpu_s: float) -> None:
         """Add a run."""
@@ -101,27 +109,53 @@ class Flight:
     methods: Mapping[str, Method]
     seed: int
     run: int
-    link: Link | None = None
+    air: Air | None = None
     link_seed: int | None = None
     """Of the links' draws; absent: those of ``seed``."""
-
-    def record(self) -> Recording:
-        """The run as it was measured and heard."""
-        recording = self.scenario.record(self.seed, self.run)
-        if self.link is None:
-            return recording
-        seed = self.seed if self.link_seed is None else self.link_seed
-        return self.link(recording, np.random.default_rng([seed, self.run, LINK_STREAM]))
+    flown: bool = True
+    """By the agents that fly; else tick by tick (`sim_bridge.studies.lockstep`), with whole links."""
 
     def fly(self) -> dict[str, Sample]:
-        """Each method's sample of this one run."""
-        recording = self.record()
-        samples = {name: Sample() for name in self.methods}
+        """Each method's sample of this one run.
+
+        A central filter has all records whatever the links do; the genie has those that could have reached an agent
+        with its settings.
+        """
+        recording = self.scenario.record(self.seed, self.run)
+        samples, heard = {name: Sample() for name in self.methods}, _FlownOnce(self, recording)
         for name, method in self.methods.items():
             begun = time.process_time()
-            result = method.run(recording) if isinstance(method, Genie) else run_lockstep(recording, method)
-            samples[name].add(recording, result, time.process_time() - begun)
+            if isinstance(method, Genie):
+                samples[name].add(recording, method.run(recording, heard.of(method.settings)), _since(begun))
+            elif self.flown and method.kind != "centralized_ekf":
+                samples[name].add_flown(recording, heard.flight(method), _since(begun))
+            else:
+                samples[name].add(recording, run_lockstep(recording, method), _since(begun))
         return samples
+
+
+def _since(begun: float) -> float:
+    return time.process_time() - begun
+
+
+class _FlownOnce:
+    """The flights of one run, each flown once: the genie wants to know what reached whom in them."""
+
+    def __init__(self, flight: Flight, recording: Recording) -> None:
+        self._flight, self._recording = flight, recording
+        self._flown: dict[EstimatorSettings, FlownResult] = {}
+
+    def flight(self, settings: EstimatorSettings) -> FlownResult:
+        """The run flown with some settings."""
+        if settings not in self._flown:
+            flight = self._flight
+            seed = channel_seed(flight.seed if flight.link_seed is None else flight.link_seed, flight.run)
+            self._flown[settings] = fly_recording(self._recording, settings, flight.air, seed=seed)
+        return self._flown[settings]
+
+    def of(self, settings: EstimatorSettings) -> NDArray[np.bool_]:
+        """Who could know what in it."""
+        return self.flight(settings).heard
 
 
 class Hangar:
@@ -150,20 +184,21 @@ def run_study(
     runs: int,
     seed: int,
     progress: Callable[[], None] | None = None,
-    link: Link | None = None,
+    air: Air | None = None,
     *,
     link_seed: int | None = None,
     hangar: Hangar | None = None,
+    flown: bool = True,
 ) -> dict[str, Sample]:
     """Every method on the same ``runs`` runs; ``progress`` is called for each run of each method.
 
-    ``link`` puts loss or delay on a run's links, with a generator of its own (the same for all methods), whose
-    seed is ``link_seed`` or else ``seed``. ``hangar`` flies in several processes.
+    ``air`` puts loss or delay on a run's links, with generators of their own (the same for all methods), whose
+    seed is ``link_seed`` or else ``seed``. ``hangar`` flies in several processes. Not ``flown``: tick by tick.
     """
     samples = {name: Sample() for name in methods}
-    flights = [Flight(scenario, methods, seed, run, link, link_seed) for run in range(runs)]
-    for flown in (Hangar() if hangar is None else hangar).map(Flight.fly, flights):
-        for name, sample in flown.items():
+    flights = [Flight(scenario, methods, seed, run, air, link_seed, flown) for run in range(runs)]
+    for of_run in (Hangar() if hangar is None else hangar).map(Flight.fly, flights):
+        for name, sample in of_run.items():
             samples[name].extend(sample)
             if progress is not None:
                 progress()
@@ -236,4 +271,9 @@ def accuracy_row(sample: Sample, first: int, last: int) -> dict[str, float | int
             row[f"{name}_transient_mean"], row[f"{name}_transient_mean_se"] = transient
     row["step_time_mean_s"] = float(np.mean(sample.step_cpu_s))
     row["failures"] = sample.not_converged + sample.fell_back
+    if sample.available:
+        row["availability_steady"] = float(np.mean([each[first : last + 1].mean() for each in sample.available]))
+        row["availability"] = float(np.mean([each[: last + 1].mean() for each in sample.available]))
+        for name in sample.bytes_per_s[0]:
+            row[f"sent_{name}_bytes_per_s"] = float(np.mean([each[name] for each in sample.bytes_per_s]))
     return row

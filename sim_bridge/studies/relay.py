@@ -1,4 +1,7 @@
-"""How measurement records travel in lockstep: who has whose records of which tick, and when.
+"""How measurement records travel between estimators that run tick by tick: who has whose records, and when.
+
+This is a model of the exchange for study inputs that say which packets arrive (`fleetloc estimate`, Table I,
+the frozen cases). What daemons exchange is flown in `sim_bridge.studies.flown`.
 
 A packet carries records of an agent's own and, with ``relay_hops``, of others, newest first, cut at what fits
 into one datagram. Within a tick packets are exchanged as often as there are consensus rounds, so that a record
@@ -13,7 +16,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.settings import EstimatorSettings
-from sim_bridge.studies.link_conditions import DoubledRecording
 from sim_bridge.studies.recording import Recording
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 
@@ -44,7 +46,6 @@ class RecordRelay:
         self._n = len(recording.agents)
         self._reached = recording.received & adjacency(recording)
         self._delay = recording.delay_ticks
-        self._doubled = recording.doubled if isinstance(recording, DoubledRecording) else None
         self._hops = settings.relay_hops
         self._exchanges = max(1, settings.rounds) if self._hops else 1
         self._memory = settings.window + 1 if self._hops else 1
@@ -52,25 +53,17 @@ class RecordRelay:
         self._known: list[dict[AgentTick, int]] = [{} for _ in range(self._n)]
         self._fresh: list[list[Arrival]] = [[] for _ in range(self._n)]
         self._under_way: dict[tuple[int, int], list[dict[AgentTick, int]]] = {}
-        self._copies: dict[tuple[int, int], list[dict[AgentTick, int]]] = {}
 
     def exchange(self, tick: int) -> list[list[Arrival]]:
-        """Run the exchanges of a tick; returns what is new to each agent, its own records included.
-
-        Records of a packet's second copy are handed out again: not to use them twice is the estimators' part.
-        """
+        """Run the exchanges of a tick; returns what is new to each agent, its own records included."""
         for slot in range(self._n):
             self._learn(slot, {(slot, tick): 0})
             for packet in self._under_way.pop((tick, slot), []):
                 self._learn(slot, packet)
-            for packet in self._copies.pop((tick, slot), []):
-                self._fresh[slot] += [Arrival(*record, hops) for record, hops in packet.items()]
         for _ in range(self._exchanges):
             packets = [self._packet(slot, tick) for slot in range(self._n)]
             for receiver, sender in np.argwhere(self._reached[tick]).tolist():
                 late = int(self._delay[tick, receiver, sender])
-                if self._doubled is not None and self._doubled[tick, receiver, sender]:
-                    self._copies.setdefault((tick + late + 1, receiver), []).append(packets[sender])
                 if late:
                     self._under_way.setdefault((tick + late, receiver), []).append(packets[sender])
                 else:

@@ -68,7 +68,7 @@ class Header:
     tick : int
         Fleet tick the packet belongs to (u32).
     round : int
-        Consensus round, 0 where there is none (u16).
+        Consensus round, or exchange of measurements of the tick; 0 where there is none (u16).
     n : int
         What the body holds (u16), see the module.
     t_ns : int

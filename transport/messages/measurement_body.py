@@ -1,4 +1,4 @@
-"""Measurement bodies: compact records of what sensors said in the last ticks, newest first.
+"""Measurement bodies: compact records of what sensors said in the last ticks, what matters most first.
 
 A packet carries the records of several ticks, own and relayed, so that one packet repairs the loss of
 earlier ones; every record names the agent whose sensor it is. Wire form of a record, little endian::
@@ -144,10 +144,14 @@ RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
 
 @dataclass(frozen=True, slots=True)
 class Measurements:
-    """Body of a measurement packet: the records an agent knows at ``tick``, newest first."""
+    """Body of a measurement packet: the records an agent tells at ``tick``, what matters most first.
+
+    ``exchange`` counts the packets of a tick from 0; it travels as the header's round.
+    """
 
     tick: int
     records: tuple[Record, ...]
+    exchange: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,27 +190,28 @@ def as_sent(record: Record) -> Record:
 def encode_measurements(
     measurements: Measurements, *, limit_bytes: int = MAX_DATAGRAM_BODY_BYTES
 ) -> EncodedMeasurements:
-    """Records as bytes, newest tick first (within a tick in the order given), cut at ``limit_bytes``.
+    """Records as bytes, in the order given, cut at ``limit_bytes``.
 
     Raises `EncodeError` for a record that is not a measurement: NaN, no variance, an id that is none, a tick
     later than the packet's.
     """
     parts: list[bytes] = []
     used = 0
-    records = sorted(measurements.records, key=lambda record: -record.tick)
-    for record in records:
+    for record in measurements.records:
         encoded = _encode_record(record, measurements.tick)
         if encoded is None:
             continue
         if used + len(encoded) > limit_bytes:
-            break  # what follows is older: better nothing than an old record in place of this one
+            break  # what follows matters less: better nothing than that in place of this one
         parts.append(encoded)
         used += len(encoded)
-    return EncodedMeasurements(b"".join(parts), len(parts), len(records) - len(parts))
+    return EncodedMeasurements(b"".join(parts), len(parts), len(measurements.records) - len(parts))
 
 
-def decode_measurements(body: bytes, *, tick: int, count: int, roster: Collection[int]) -> Measurements:
-    """Records of a body whose header says ``tick`` and ``count``; raises `Rejected` unless all are good."""
+def decode_measurements(
+    body: bytes, *, tick: int, count: int, roster: Collection[int], exchange: int = 0
+) -> Measurements:
+    """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good."""
     records: list[Record] = []
     at = 0
     for _ in range(count):
@@ -219,7 +224,7 @@ def decode_measurements(body: bytes, *, tick: int, count: int, roster: Collectio
         at += layout.size
     if at != len(body):
         raise Rejected(Reason.MALFORMED, f"{len(body) - at} bytes after the last record")
-    return Measurements(tick, tuple(records))
+    return Measurements(tick, tuple(records), exchange)
 
 
 # --- one record --------------------------------------------------------------------------------------------

@@ -137,7 +137,7 @@ class Opener:
         h, double = header, bool(header.flags & FLAG_FLOAT64)
         match header.kind:
             case PacketKind.MEAS:
-                return decode_measurements(body, tick=h.tick, count=h.n, roster=self._roster)
+                return decode_measurements(body, tick=h.tick, count=h.n, roster=self._roster, exchange=h.round)
             case PacketKind.INFO:
                 part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)

@@ -74,7 +74,7 @@ class Sealer:
             case Measurements():
                 encoded = encode_measurements(message)
                 self.left_out += encoded.left_out
-                return [_Body(PacketKind.MEAS, encoded.body, message.tick, n=encoded.count)]
+                return [_Body(PacketKind.MEAS, encoded.body, message.tick, message.exchange, encoded.count)]
             case Information():
                 if double is None:
                     double = not float32_suffices(message.information)

@@ -55,7 +55,7 @@ class Agent:
         if record.observer == 1:
             taken: Record | None = self.store.add_own(record)
         else:
-            taken = record if self.store.add_heard([record], self.tick) else None
+            taken = record if self.store.add_heard(record.observer, [record], self.tick) else None
         if taken is not None:
             self.tracker.note(taken, self.tick)
 

@@ -135,43 +135,41 @@ def test_each_record_is_handed_out_once_and_inputs_only_when_they_have_acted(
     store.neighbourhood.hear(2, 5)
     for _ in range(3):
         store.add_own(position(1, 5))
-        store.add_heard([position(2, 5)], 5)
-        store.add_heard([acceleration(2, 5)], 5)
-        store.add_heard([position(2, 6)], 5)
+        store.add_heard(2, [position(2, 5)], 5)
+        store.add_heard(2, [acceleration(2, 5)], 5)
+        store.add_heard(2, [position(2, 6)], 5)
     rows, inputs = store.take(5, IDS, IDS)
     assert (sorted(rows["agent"].tolist()), len(inputs)) == ([0, 0, 0, 1, 1, 1], 0)
     rows, inputs = store.take(6, IDS, IDS)
     assert (rows["tick"].tolist(), inputs["tick"].tolist()) == ([6] * 3, [5])
     assert len(store.take(7, IDS, IDS)[0]) == 0
-    store.add_heard([position(2, 5)], 7)
+    store.add_heard(2, [position(2, 5)], 7)
     assert len(store.take(8, IDS, IDS)[0]) == 0
 
 
-def test_a_record_is_taken_in_once_as_the_same_object_and_as_a_copy(make_config: Callable[..., FleetConfig]) -> None:
-    # GIVEN all hear all, WHEN a packet repeats a record, as the object of before and decoded anew, among new ones
+def test_a_record_is_taken_in_once_however_often_it_comes(make_config: Callable[..., FleetConfig]) -> None:
+    # GIVEN all hear all, WHEN packets repeat records among new ones
     store = RecordStore(make_config(), 1)
     for other in (2, 3):
         store.neighbourhood.hear(other, 6)
-    first, second, third = position(2, 5), position(2, 6), position(3, 6)
     own = store.add_own(position(1, 6))
     assert own is not None
-    assert store.add_heard([second, first], 6) == [second, first]
-    assert store.add_heard([second, position(2, 5), third, own, third], 6) == [third]
-    # THEN nothing is used or sent twice, and ours comes first
+    assert store.add_heard(2, [position(2, 6), position(2, 5)], 6) == [position(2, 6), position(2, 5)]
+    assert store.add_heard(3, [position(2, 6), position(3, 6), own, position(3, 6)], 6) == [position(3, 6)]
+    # THEN nothing is used twice
     assert store.take(6, IDS, IDS)[0]["agent"].tolist() == [0] * 3 + [1] * 6 + [2] * 3
-    assert store.packet(6).records[0] is own
     assert not store.refused
     # AND a record long forgotten does not stand in the way of another
     store.forget(200)
     store.neighbourhood.hear(2, 200)
-    assert store.add_heard([position(2, 200)], 200)
+    assert store.add_heard(2, [position(2, 200)], 200)
 
 
 def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig]) -> None:
     store = RecordStore(make_config(), 1)
     store.neighbourhood.hear(2, 20)
     store.take(20, IDS, IDS)
-    store.add_heard([position(2, 18, offset_s=0.04)], 20)
+    store.add_heard(2, [position(2, 18, offset_s=0.04)], 20)
     rows, _ = store.take(21, IDS, IDS)
     assert rows["tick"].tolist() == [18] * 3
     assert rows["offset_s"] == pytest.approx([0.04] * 3)
@@ -180,24 +178,61 @@ def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig
 def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[..., FleetConfig]) -> None:
     store = RecordStore(make_config(), 1)
     store.neighbourhood.hear(2, 100)
-    assert not store.add_heard([position(2, 100 - 65)], 100)
-    assert not store.add_heard([position(2, 103)], 100)
-    assert not store.add_heard([position(1, 100)], 100)
-    assert store.add_heard([position(2, 102)], 100)
+    assert not store.add_heard(2, [position(2, 100 - 65)], 100)
+    assert not store.add_heard(2, [position(2, 103)], 100)
+    assert not store.add_heard(2, [position(1, 100)], 100)
+    assert store.add_heard(2, [position(2, 102)], 100)
     assert dict(store.refused) == {"heard: too old": 1, "heard: of the future": 1}
 
 
-def test_packets_repeat_the_last_ticks_newest_first_and_relay_nothing_unasked(
+def told(store: RecordStore, tick: int, *neighbours: int) -> list[tuple[int, int]]:
+    """(observer, tick) of what a packet says, in its order."""
+    return [(record.observer, record.tick) for record in store.packet(tick, 0, neighbours).records]
+
+
+def test_while_nobody_is_heard_packets_repeat_the_last_ticks_newest_first(
     make_config: Callable[..., FleetConfig],
 ) -> None:
     store = RecordStore(make_config(3, "transport.history_ticks=3", "estimator.share_inputs=none"), 1)
     for tick in range(10):
         store.add_own(position(1, tick))
         store.add_own(acceleration(1, tick))
-        store.add_heard([position(2, tick)], tick)
-    packet = store.packet(8)
-    assert packet.tick == 8
+    packet = store.packet(8, 1, ())
+    assert (packet.tick, packet.exchange) == (8, 1)
     assert [(record.observer, record.tick) for record in packet.records] == [(1, 8), (1, 7), (1, 6)]
+
+
+def test_a_record_is_told_until_every_neighbour_has_said_it(make_config: Callable[..., FleetConfig]) -> None:
+    # GIVEN drone 2 between 1 and 3
+    store = RecordStore(line(make_config, 3, "estimator.relay_hops=1"), 2)
+    store.add_own(position(2, 5))
+    store.add_heard(1, [position(1, 5)], 5)
+    # THEN its own record goes to both, that of 1 is for 3
+    assert told(store, 5, 1, 3) == [(2, 5), (1, 5)]
+    assert store.lacked(6, (1, 3))
+    # WHEN 1 says our record back, THEN it is still told, for 3
+    store.add_heard(1, [position(2, 5)], 6)
+    assert told(store, 6, 1, 3) == [(2, 5), (1, 5)]
+    # WHEN 3 says both, THEN neither is told any more
+    store.add_heard(3, [position(2, 5), position(1, 5)], 6)
+    assert not store.lacked(7, (1, 3))
+    assert told(store, 7, 1, 3) == [(1, 5)]  # an echo: 3 knows then that we have it
+    assert told(store, 8, 1, 3) == []
+    # AND another neighbour that turns up gets all
+    assert told(store, 8, 1, 3, 4) == [(2, 5), (1, 5)]
+
+
+def test_what_is_heard_is_said_back_once_behind_what_is_lacked(make_config: Callable[..., FleetConfig]) -> None:
+    # GIVEN an end of a line, that relays to nobody
+    store = RecordStore(line(make_config, 3, "estimator.relay_hops=0"), 1)
+    store.add_heard(2, [position(2, 5), position(2, 4)], 5)
+    store.add_own(position(1, 5))
+    # THEN its packet holds its own record and the echoes, the next one its own alone
+    assert told(store, 5, 2) == [(1, 5), (2, 5), (2, 4)]
+    assert told(store, 5, 2) == [(1, 5)]
+    # AND a record that comes again, since its sender has not heard so, is said again
+    store.add_heard(2, [position(2, 5)], 5)
+    assert told(store, 5, 2) == [(1, 5), (2, 5)]
 
 
 @pytest.mark.parametrize(
@@ -247,8 +282,8 @@ def test_memory_stays_bounded(make_config: Callable[..., FleetConfig]) -> None:
     store = RecordStore(make_config(), 1)
     for tick in range(1000):
         store.add_own(position(1, tick))
-        store.add_heard([RangeRecord(2, tick, 3, 4.0, 0.1)], tick)
-        store.add_heard([VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
+        store.add_heard(2, [RangeRecord(2, tick, 3, 4.0, 0.1)], tick)
+        store.add_heard(3, [VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
         store.take(tick, IDS, IDS)
     kept = held(store)
     for kind in (PositionRecord, RangeRecord, VelocityRecord):
@@ -261,11 +296,11 @@ def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_t
     # GIVEN a fix of 3 and ranges 1-3 and 1-2, WHEN 2 is no member and 3 is not located yet
     store = RecordStore(make_config(3, "estimator.window=4"), 1)
     store.neighbourhood.hear(3, 10)
-    store.add_heard([position(3, 10)], 10)
+    store.add_heard(3, [position(3, 10)], 10)
     store.add_own(RangeRecord(1, 10, 3, 4.0, 0.1))
     store.add_own(RangeRecord(1, 10, 2, 5.0, 0.1))
     store.add_own(acceleration(1, 9))
-    store.add_heard([acceleration(3, 9)], 10)
+    store.add_heard(3, [acceleration(3, 9)], 10)
     rows, inputs = store.take(10, (1,), (1,))
     assert (len(rows), inputs["agent"].tolist()) == (0, [0])
     # THEN what names 3 comes once it is, with its slot, and what names 2 stays

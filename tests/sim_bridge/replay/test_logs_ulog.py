@@ -231,5 +231,5 @@ def test_without_the_package_the_line_says_what_to_install(tmp_path: Path, monke
         return genuine(name, *args, **kwargs)
 
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(LogError, match=r"pip install '\.\[ulog\]'"):
+    with pytest.raises(LogError, match=r"pip install 'fleetloc\[ulog\]'"):
         read(path)

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from estimators.integrity.consistency import average_nees_band, nees, nis, rms
-from estimators.settings import EstimatorSettings
+from estimators.settings import EstimatorSettings, default_settings
+from sim_bridge.studies.air import lossy
 from sim_bridge.studies.lockstep import LockstepResult
 from sim_bridge.studies.monte_carlo import (
     Flight,
@@ -233,13 +234,24 @@ def test_several_processes_give_what_one_gives() -> None:
 
 
 def test_links_have_a_seed_of_their_own() -> None:
-    def noted(recording, rng):  # type: ignore[no-untyped-def]
-        return replace(recording, x0=recording.x0 * 0.0 + rng.random())
+    def flown(seed: int, link_seed: int | None) -> np.ndarray:
+        flight = Flight(Scenario(samples=4), {"it": default_settings()}, seed, 0, lossy(0.5), link_seed)
+        return flight.fly()["it"].norm_full[0]
 
-    def drawn(seed: int, link_seed: int | None) -> float:
-        return float(Flight(Scenario(samples=1), {}, seed, 0, noted, link_seed).record().x0[0, 0])
+    np.testing.assert_array_equal(flown(1, None), flown(1, 1))
+    assert (flown(1, None) != flown(1, 2)).any()
 
-    assert drawn(1, None) == drawn(1, 1) == drawn(2, 1) != drawn(2, None)
+
+def test_a_study_is_flown_or_runs_tick_by_tick_and_says_what_was_served() -> None:
+    methods = {"it": default_settings(), "central": EstimatorSettings(kind="centralized_ekf")}
+    flown = run_study(Scenario(samples=6), methods, 1, seed=2)
+    assert [len(flown[name].available) for name in methods] == [1, 0]  # a central filter does not fly
+    row = accuracy_row(flown["it"], 1, 6)
+    assert row["availability"] == 1.0
+    assert row["sent_all_bytes_per_s"] > 0
+    stepped = run_study(Scenario(samples=6), methods, 1, seed=2, flown=False)
+    assert not stepped["it"].available
+    np.testing.assert_array_equal(stepped["central"].norm_full[0], flown["central"].norm_full[0])
 
 
 def test_rows_of_the_tables_by_hand() -> None:
@@ -313,7 +325,7 @@ def test_small_study() -> None:
         "central": EstimatorSettings(kind="centralized_ekf", iterations_ekf=10),
     }
     calls = []
-    samples = run_study(Scenario(), methods, runs, seed=11, progress=lambda: calls.append(1))
+    samples = run_study(Scenario(), methods, runs, seed=11, progress=lambda: calls.append(1), flown=False)
     assert len(calls) == runs * len(methods)
     rows = {name: accuracy_row(sample, 41, 70) for name, sample in samples.items()}
     # THEN the steady figures are those known from twenty other runs (.301, .185, .109), a run scattering by a fifth

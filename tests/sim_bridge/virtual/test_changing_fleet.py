@@ -161,9 +161,9 @@ def test_the_change_goes_through_sealed_packets_too() -> None:
 
 
 def test_neighbours_who_see_other_fleets_still_exchange_pairs() -> None:
-    # GIVEN a line in which the ends do not hear each other, WHEN one end joins late
+    # GIVEN a line in which the ends do not hear each other and news goes one hop a tick, WHEN one end joins late
     events = FleetEvents(away=(Interval(3, 0.0, 4.0),))
-    flight = Flight("line3.toml", 8.0, events)
+    flight = Flight("line3.toml", 8.0, events, "transport.exchanges=1")
     # THEN while the views differ pairs are mapped and used, none is refused for its members
     for agent_id in (1, 2):
         assert flight.report.counters[agent_id]["information: other members"] > 0

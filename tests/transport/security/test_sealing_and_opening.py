@@ -124,7 +124,7 @@ def test_estimates_and_information_come_back() -> None:
 
 
 def test_a_full_measurement_packet_keeps_the_datagram_limit_and_counts_the_rest() -> None:
-    records = tuple(PositionRecord(2, t, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)) for t in range(100))
+    records = tuple(PositionRecord(2, t, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)) for t in range(99, -1, -1))
     sender = sealer()
     (packet,) = sender.seal(Measurements(99, records), t_ns=T_NS)
     assert len(packet.data) <= MAX_DATAGRAM_BYTES

@@ -1,4 +1,4 @@
-# The image of every part of a fleet: daemon, simulator, report, monitor. docs/containers.md says how to use it.
+# The image of every part of a fleet: daemon, simulator, report, monitor. docs/operating.md says how to use it.
 # Two stages: what compiles and installs stays in the first. The second runs as nobody in particular, on a root
 # file system that may be read-only; it writes to /data (records, reports) and /tmp only.
 ARG BASE_IMAGE=python:3.12-slim

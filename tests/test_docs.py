@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import shlex
 import tomllib
@@ -29,7 +30,7 @@ from transport.errors import Reason
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted(DOCS.glob("*.md"))]
+PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
 SITE = ROOT / "mkdocs.yml"
 FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<text>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL)
 INLINE = re.compile(r"`(fleetloc [^`\n]+)`")
@@ -195,6 +196,35 @@ def test_the_first_configuration_is_whole() -> None:
     assert config.ids == (1, 2, 3)
 
 
+def known_keys() -> set[str]:
+    """Every ``table.key`` of the configuration and the tables inside tables, former keys left out."""
+    page = (DOCS / "configuration.md").read_text(encoding="utf-8").partition("\n# Former keys")[0]
+    keys: set[str] = set()
+    for heading, body in re.findall(r"^##+ (`\[+[\w.]+\]+`.*?)$(.*?)(?=^##|\Z)", page, re.MULTILINE | re.DOTALL):
+        table = re.sub(r"[`\[\]]", "", heading).split(",")[0]
+        keys |= {table} | {f"{table}.{key}" for key in re.findall(r"^\| `(\w+)` \|", body, re.MULTILINE)}
+    return keys
+
+
+def test_every_key_that_a_page_names_exists() -> None:
+    """GIVEN ``table.key`` in the text of a page WHEN the table is one of the configuration THEN so is the key."""
+    keys = known_keys()
+    tables = {key.partition(".")[0] for key in keys}
+    assert len(keys) > 100
+    wrong, seen = [], 0
+    for page in PAGES:
+        if page.name in ("configuration.md", "CHANGELOG.md"):  # these name former keys
+            continue
+        text = FENCE.sub("", page.read_text(encoding="utf-8"))
+        for name in re.findall(r"`(?:--set )?([a-z]+(?:\.\w+)+)\b(?![/(])", text):
+            if name.partition(".")[0] in tables and not name.endswith((".py", ".toml", ".md")):
+                seen += 1
+                if re.sub(r"\.\d+\.", ".", name) not in keys:
+                    wrong.append(f"{page.name}: {name}")
+    assert not wrong, wrong
+    assert seen > 50
+
+
 # --- the driver -----------------------------------------------------------------------------------------------
 
 
@@ -265,3 +295,44 @@ def test_the_reasons_of_refusal_that_are_explained_exist() -> None:
 def test_the_daemons_own_exit_codes_are_the_ones_told() -> None:
     told = {int(code) for code in re.findall(r"exit (\d)", troubleshooting())}
     assert told <= {int(code) for code in ExitCode}
+
+
+# --- the walks ------------------------------------------------------------------------------------------------
+
+
+def walks() -> dict[str, list[tuple[str, str, str]]]:
+    """(room, file, function) of each row of each walk in the page on architecture."""
+    section = (
+        (DOCS / "architecture.md").read_text(encoding="utf-8").partition("## Five walks\n")[2].partition("\n## ")[0]
+    )
+    found: dict[str, list[tuple[str, str, str]]] = {}
+    for walk in section.split("\n### ")[1:]:
+        rows = re.findall(r"^\| (\w*) ?\| `([\w/.]+)` \| `([\w.]+)` \|", walk, re.MULTILINE)
+        found[walk.partition("\n")[0]] = rows
+    return found
+
+
+@pytest.mark.parametrize("walk", walks())
+def test_each_walk_enters_a_room_once(walk: str) -> None:
+    rows = walks()[walk]
+    entered = [room for room, _, _ in rows if room]
+    assert rows[0][0]
+    assert len(set(entered)) == len(entered) >= 2
+    room = ""
+    for name, file, _ in rows:
+        room = name or room
+        assert file.startswith(f"{room}/"), f"{walk}: {file} stands under {room}"
+
+
+@pytest.mark.parametrize("walk", walks())
+def test_the_functions_of_each_walk_are_in_their_files(walk: str) -> None:
+    for _, file, function in walks()[walk]:
+        found: Any = importlib.import_module(file.removesuffix(".py").replace("/", "."))
+        for name in function.split("."):
+            assert hasattr(found, name), f"{walk}: {file} has no {function}"
+            found = getattr(found, name)
+
+
+def test_there_are_five_walks() -> None:
+    assert len(walks()) == 5
+    assert all(len(rows) > 8 for rows in walks().values())

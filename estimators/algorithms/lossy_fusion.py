@@ -1,6 +1,6 @@
 """Tracking over links that hold and delay packets without saying so: Fu, Bi and Gao 2017, corrected.
 
-For comparison with the fleet's own estimators (`fleetloc bench fusion`); docs/lossy_fusion.md says what was wrong
+For comparison with the fleet's own estimators (`fleetloc bench fusion`); docs/results.md says what was wrong
 in print. One target with state x = [p (3), v (3)], NED m and m/s, is measured by L agents,
 
     x_{k+1} = Phi x_k + Gam w_k,      z^i_k = p_k + v^i_k,

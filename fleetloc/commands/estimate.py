@@ -20,7 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 def estimate(
-    recording: Annotated[Path, typer.Argument(help="Recording (.npz), see docs/recordings.md.")],
+    recording: Annotated[Path, typer.Argument(help="Recording (.npz), see docs/replay.md.")],
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file; only its [estimator] table is read.")
     ] = None,

@@ -1,4 +1,4 @@
-"""Recordings: the tick-level inputs of a whole fleet run in one ``.npz`` (docs/recordings.md).
+"""Recordings: the tick-level inputs of a whole fleet run in one ``.npz`` (docs/replay.md).
 
 Arrays only, no pickles. n agents, T ticks after the first, NED metres and seconds.
 """

@@ -1,4 +1,4 @@
-"""A hostile peer against a running daemon: what is refused and counted, and what it costs; see docs/robustness.md.
+"""A hostile peer against a running daemon: what is refused and counted, and what it costs; see docs/results.md.
 
 ``python -m tests.fleet.fuzz_daemon --packets 100000 --datagrams 100000 --seed 0`` from the root of the repository
 flies line3 with signed packets on free loopback ports and fuzzes agent 2, in the middle of the line, over a real

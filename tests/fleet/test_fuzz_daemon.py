@@ -1,4 +1,4 @@
-"""A running daemon under a few thousand hostile packets and datagrams; docs/robustness.md has the full run."""
+"""A running daemon under a few thousand hostile packets and datagrams; docs/results.md has the full run."""
 
 from __future__ import annotations
 

@@ -34,7 +34,7 @@ def neighbour_lists(options: dict[str, Any]) -> list[list[int]]:
 
 
 def case_recording(arrays: dict[str, Any], options: dict[str, Any]) -> dict[str, Any]:
-    """The arrays of the recording (format: docs/recordings.md)."""
+    """The arrays of the recording (format: docs/replay.md)."""
     n = options["na"]
     ticks = len(arrays["y"])
     gps = np.full((ticks, n, 4), np.nan)

@@ -82,13 +82,13 @@ def test_another_file_is_refused_by_name(read: object, name: str, tmp_path: Path
 def test_the_shown_replay_repeats_a_record(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    page = (ROOT / "docs/recordings.md").read_text(encoding="utf-8")
+    page = (ROOT / "docs/replay.md").read_text(encoding="utf-8")
     script = page.partition("```python\nfrom fleetloc")[2].partition("```")[0]
     (tmp_path / "out/line3").mkdir(parents=True)
     for suffix in (".mcap", ".tlog"):
         (tmp_path / "out/line3/agent_001").with_suffix(suffix).symlink_to(RECORD.with_suffix(suffix))
     monkeypatch.chdir(tmp_path)
-    exec(compile("from fleetloc" + script, "docs/recordings.md", "exec"), {})
+    exec(compile("from fleetloc" + script, "docs/replay.md", "exec"), {})
     compared, different, difference = capsys.readouterr().out.split()
     assert int(compared) > 10
     assert int(different) <= int(compared)

@@ -49,7 +49,7 @@ def test_an_import_loads_no_room_and_a_name_only_its_own() -> None:
     assert set(then) <= {"transport", "numpy"}
 
 
-@pytest.mark.parametrize("page", ["uwb.md", "recordings.md", "python.md"])
+@pytest.mark.parametrize("page", ["uwb.md", "replay.md", "python.md"])
 def test_scripts_that_are_shown_use_only_what_is_public(page: str) -> None:
     text = (ROOT / "docs" / page).read_text(encoding="utf-8")
     imported: set[str] = set()

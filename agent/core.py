@@ -26,9 +26,9 @@ from enum import Enum, auto
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.measurement_store import MeasurementStore
+from agent.fleet.measurements import acceleration_measurement, gps_measurements, range_measurement
 from agent.fleet.neighbours import NeighbourTable
-from agent.fleet.record_store import RecordStore
-from agent.fleet.records import acceleration_record, gps_records, range_record
 from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
 from agent.fleet.tracking import FleetTracker, in_layout
@@ -44,7 +44,7 @@ from estimators.integrity.staleness import Ages, gps_lost
 from estimators.model.layout import Layout, block
 from transport.link.rounds import RoundBarrier
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements, Record
+from transport.messages.measurement_body import Measurement, Measurements
 from transport.security.opening import Received
 
 USUAL_EXCHANGES = 2
@@ -78,7 +78,7 @@ class AgentCore:
         """Of all who may come: that of the estimates handed out."""
         self.timeline = timeline
         self.gps_latency = GpsLatency(self._period_s, config.sensors)
-        self.records = RecordStore(config, agent_id)
+        self.records = MeasurementStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
         self.watch = PositionWatch(config.transport.neighbour_timeout_s)
         self.health = HealthMonitor()
@@ -125,7 +125,7 @@ class AgentCore:
             return
         self._last_fix_s = now_s
         corrected = self.gps_latency.on_fix(sample)
-        for record in gps_records(self._agent_id, corrected, self._period_s, self._config.sensors):
+        for record in gps_measurements(self._agent_id, corrected, self._period_s, self._config.sensors):
             self._on_own_record(record)
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
@@ -133,7 +133,7 @@ class AgentCore:
         if sample.observer != self._agent_id or sample.target not in self.layout.agents:
             self.counters["range: not ours"] += 1
         elif self._plausible("range", sample.t_s, now_s):
-            self._on_own_record(range_record(sample, self._period_s, self._config.sensors))
+            self._on_own_record(range_measurement(sample, self._period_s, self._config.sensors))
 
     def on_packet(self, received: Received, now_s: float) -> None:
         """A neighbour's message, opened and checked by the transport."""
@@ -163,7 +163,7 @@ class AgentCore:
         self.counters[f"{sensor}: wrong time"] += 1
         return False
 
-    def _on_own_record(self, record: Record) -> None:
+    def _on_own_record(self, record: Measurement) -> None:
         rounded = self.records.add_own(record)
         if rounded is not None:
             self.fleet.note(rounded, rounded.tick if self._tick is None else self._tick)
@@ -252,7 +252,7 @@ class AgentCore:
         assert self._tick is not None
         self._input = self.timeline.close(self._tick)
         self.gps_latency.on_tick(self._input)
-        self._on_own_record(acceleration_record(self._agent_id, self._input))
+        self._on_own_record(acceleration_measurement(self._agent_id, self._input))
         self._tell_records(0, now_s, outputs)
         self._phase = _Phase.PACKETS
 

@@ -12,7 +12,7 @@ from agent.sensing.samples import Triple
 from estimators.integrity.thresholds import FIX_MEMORY_TICKS
 from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
-from transport.messages.measurement_body import PositionRecord, Record, VelocityRecord
+from transport.messages.measurement_body import Measurement, PositionMeasurement, VelocityMeasurement
 
 TRACK_FIXES = 20
 ENOUGH_FIXES = 10
@@ -31,16 +31,16 @@ class FixTracks:
         self._settings = config.initial
         self._period_s = config.fleet.period_s
         self._motions = motions
-        self._fixes: dict[int, deque[PositionRecord]] = {}
+        self._fixes: dict[int, deque[PositionMeasurement]] = {}
         self._count: Counter[int] = Counter()
-        self._velocities: dict[int, VelocityRecord] = {}
+        self._velocities: dict[int, VelocityMeasurement] = {}
 
-    def note(self, record: Record) -> None:
+    def note(self, record: Measurement) -> None:
         """Take in a record."""
-        if isinstance(record, PositionRecord):
+        if isinstance(record, PositionMeasurement):
             self._count[record.observer] += 1
             self._fixes.setdefault(record.observer, deque(maxlen=TRACK_FIXES)).append(record)
-        elif isinstance(record, VelocityRecord):
+        elif isinstance(record, VelocityMeasurement):
             known = self._velocities.get(record.observer)
             if known is None or record.tick >= known.tick:
                 self._velocities[record.observer] = record

@@ -19,7 +19,7 @@ from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
-from transport.messages.measurement_body import RangeRecord, Record
+from transport.messages.measurement_body import Measurement, RangeMeasurement
 
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
@@ -37,16 +37,16 @@ class RangeLocator:
     def __init__(self, config: FleetConfig, motions: Motions) -> None:
         self._period_s = config.fleet.period_s
         self._speed_sigma_mps = config.initial.speed_sigma_mps
-        self._ranges: deque[RangeRecord] = deque(maxlen=4096)
+        self._ranges: deque[RangeMeasurement] = deque(maxlen=4096)
         self._motions = motions
         self._known: dict[int, _Known] = {}
         self._monitor = RangeLocationMonitor()
         self.findings: dict[int, tuple[Finding, ...]] = {}
         """Why a drone's ranges did not locate it, as of the last attempt."""
 
-    def note(self, record: Record) -> None:
+    def note(self, record: Measurement) -> None:
         """Take in a record, own or heard."""
-        if isinstance(record, RangeRecord):
+        if isinstance(record, RangeMeasurement):
             self._ranges.append(record)
 
     def note_places(self, tick: int, known: _Known) -> None:
@@ -97,7 +97,7 @@ class RangeLocator:
         return multilaterate(ranges, self._speed_sigma_mps)
 
 
-def _other_end(record: RangeRecord, agent_id: int) -> int | None:
+def _other_end(record: RangeMeasurement, agent_id: int) -> int | None:
     if record.observer == agent_id:
         return record.other
     return record.observer if record.other == agent_id else None

@@ -29,7 +29,7 @@ from estimators.model.measurements import Vector
 from estimators.model.unknown_motion import silence_sigma_m
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import AccelerationRecord, RangeRecord, Record
+from transport.messages.measurement_body import AccelerationMeasurement, Measurement, RangeMeasurement
 
 ATTEMPT_EVERY_TICKS = 3
 """Places by ranges are sought this often: an attempt takes some milliseconds."""
@@ -47,7 +47,7 @@ def _pair(one: int, other: int) -> tuple[int, int]:
     return (one, other) if one < other else (other, one)
 
 
-class Roll:
+class Membership:
     """The drones of the estimate and what is known of the others; ``members`` in the order of the configuration."""
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
@@ -82,14 +82,14 @@ class Roll:
 
     # --- what comes in -------------------------------------------------------------------------------------
 
-    def note(self, record: Record, tick: int) -> None:
+    def note(self, record: Measurement, tick: int) -> None:
         """A record, own or heard."""
         when = min(record.tick, tick)
         if when > self._heard.get(record.observer, -math.inf):
             self._heard[record.observer] = when
-        if isinstance(record, AccelerationRecord):
+        if isinstance(record, AccelerationMeasurement):
             self._motions.note(record)
-        elif isinstance(record, RangeRecord):
+        elif isinstance(record, RangeMeasurement):
             self._locator.note(record)
             pair = _pair(record.observer, record.other)
             if when > self._ranged.get(pair, -math.inf):

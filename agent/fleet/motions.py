@@ -7,7 +7,7 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.unknown_motion import unseen_variance
-from transport.messages.measurement_body import AccelerationRecord, Record
+from transport.messages.measurement_body import AccelerationMeasurement, Measurement
 
 MEMORY_TICKS = 60
 
@@ -18,11 +18,11 @@ class Motions:
     def __init__(self, config: FleetConfig) -> None:
         self._period_s = config.fleet.period_s
         self._unknown_variance = config.estimator.other_accel_variance
-        self._known: dict[int, dict[int, AccelerationRecord]] = {}
+        self._known: dict[int, dict[int, AccelerationMeasurement]] = {}
 
-    def note(self, record: Record) -> None:
+    def note(self, record: Measurement) -> None:
         """Take in a record, own or heard."""
-        if isinstance(record, AccelerationRecord):
+        if isinstance(record, AccelerationMeasurement):
             known = self._known.setdefault(record.observer, {})
             known[record.tick] = record
             if len(known) > 2 * MEMORY_TICKS:

@@ -1,6 +1,6 @@
 """The estimator of an agent through start, change of the fleet, and fault; it never stops, it only says less.
 
-The estimator works on the drones that are present (`agent.fleet.membership.Roll`). What leaves the house is in
+The estimator works on the drones that are present (`agent.fleet.membership.Membership`). What leaves the house is in
 the layout of the whole configured fleet: an absent drone's block is at zero with a variance of 1e8 and the age
 "never" (`agent.fleet.membership.is_absent`).
 """
@@ -15,8 +15,8 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import POSITION_SIGMA_M
-from agent.fleet.membership import Roll
-from agent.fleet.record_store import RecordStore
+from agent.fleet.measurement_store import MeasurementStore
+from agent.fleet.membership import Membership
 from estimators.consensus.mapping import mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
 from estimators.model.gaussian import Prior
@@ -26,7 +26,7 @@ from estimators.model.unknown_motion import unseen_variance
 from estimators.settings import EstimatorSettings
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Record
+from transport.messages.measurement_body import Measurement
 
 EstimatorFactory = Callable[[EstimatorSettings, Layout, int, Vector, Matrix, float], Estimator]
 """(settings, layout, own slot, prior mean, prior covariance, period in s) -> estimator."""
@@ -66,7 +66,7 @@ class FleetTracker:
         self._estimator: Estimator | None = None
         self._good: _Good | None = None
         self._since_s: float | None = None
-        self.roll = Roll(config, agent_id)
+        self.roll = Membership(config, agent_id)
         self.present: tuple[int, ...] = ()
         """Whom the latest estimate speaks of, in the order of its blocks."""
 
@@ -80,13 +80,13 @@ class FleetTracker:
         """Rows and inputs that came too late for the estimator's window."""
         return 0 if self._estimator is None else self._estimator.dropped
 
-    def note(self, record: Record, tick: int) -> None:
+    def note(self, record: Measurement, tick: int) -> None:
         """A record, own or heard, at the current tick."""
         self.roll.note(record, tick)
 
     # --- the tick ------------------------------------------------------------------------------------------
 
-    def begin(self, tick: int, now_s: float, records: RecordStore) -> bool:
+    def begin(self, tick: int, now_s: float, records: MeasurementStore) -> bool:
         """Let the fleet change and open the tick; false while nobody is located."""
         if self._estimator is None:
             if not self._start(tick, now_s):
@@ -171,7 +171,7 @@ class FleetTracker:
     def forget(self) -> None:
         """Begin from nothing."""
         self._estimator, self._good, self._since_s = None, None, None
-        self.roll = Roll(self._config, self._agent_id)
+        self.roll = Membership(self._config, self._agent_id)
 
     # --- start and change ----------------------------------------------------------------------------------
 

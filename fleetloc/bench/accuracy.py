@@ -14,7 +14,7 @@ from fleetloc.bench.plots import curves, save
 from fleetloc.bench.sweep import Point, fly, numbered, show, steady_from
 from fleetloc.output import print_table, progress_bar, with_error
 from sim_bridge.studies.monte_carlo import Method, run_study, table1_row
-from sim_bridge.studies.study_scenario import GRAPHS, Scenario, graph_of
+from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario, graph_of
 
 PAPER_TABLE1 = {
     "dekf_ci": (2.7651, 0.7059),
@@ -36,7 +36,7 @@ def table1(
         "dmhe_pre_ekf": replace(common, kind="dmhe_pre_ekf"),
         "dmhe_pre_ekf_2": replace(common, kind="dmhe_pre_ekf", rounds=2),
     }
-    scenario = Scenario("line", samples, period_s, "paper" if start == "paper" else "good")
+    scenario = StudyScenario("line", samples, period_s, "paper" if start == "paper" else "good")
     with progress_bar("runs", runs * len(methods)) as advance:
         study = run_study(scenario, methods, runs, seed, advance, flown=False)
     rows = {name: table1_row(sample, samples) for name, sample in study.items()}
@@ -68,7 +68,7 @@ def table1(
 
 
 def accuracy(
-    *, runs: int, seed: int, scenario: Scenario, methods: Mapping[str, Method], sweeps: Sequence[Point] = (),
+    *, runs: int, seed: int, scenario: StudyScenario, methods: Mapping[str, Method], sweeps: Sequence[Point] = (),
     jobs: int = 1, out: Path | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Run methods on one scenario and along axes, print accuracy and consistency, return all figures."""
@@ -108,7 +108,11 @@ AXES = {
 
 
 def sweep_points(
-    scenario: Scenario, family: str, agents: Sequence[int], gps_shares: Sequence[float], offsets_m: Sequence[float]
+    scenario: StudyScenario,
+    family: str,
+    agents: Sequence[int],
+    gps_shares: Sequence[float],
+    offsets_m: Sequence[float],
 ) -> list[Point]:
     """Fleets of other sizes, other shares of GPS, other errors of the start; all else as in ``scenario``.
 

@@ -13,7 +13,7 @@ from estimators.estimator import Status
 from fleetloc.bench.sweep import Point, fly
 from fleetloc.output import print_table
 from sim_bridge.studies.monte_carlo import Method, Sample, mean_and_error
-from sim_bridge.studies.study_scenario import GRAPHS, Scenario
+from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario
 
 SAMPLES = 100
 FIRST = 80
@@ -38,9 +38,9 @@ class BlindCase:
         agents, edges = GRAPHS[self.graph]
         return sum(agents - 1 in edge for edge in edges)
 
-    def scenario(self) -> Scenario:
+    def scenario(self) -> StudyScenario:
         """Every agent's estimate of every position is wrong by ``start_sigma_m`` per axis, and knows it."""
-        return Scenario(self.graph, SAMPLES, blind=1, start_sigma_m=self.start_sigma_m)
+        return StudyScenario(self.graph, SAMPLES, blind=1, start_sigma_m=self.start_sigma_m)
 
 
 CASES = (

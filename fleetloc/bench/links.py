@@ -12,7 +12,7 @@ from fleetloc.bench.sweep import STEADY_FROM, Flown, Point, fly, numbered, show
 from fleetloc.output import print_table, with_error
 from sim_bridge.studies.air import Air, bursty, fu_channel, lossy
 from sim_bridge.studies.monte_carlo import Method
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_scenario import StudyScenario
 from transport.link.channel import LinkFaults
 
 CHANNELS: dict[str, tuple[str, Air, str]] = {
@@ -27,7 +27,7 @@ CHANNELS: dict[str, tuple[str, Air, str]] = {
 
 def points(losses: Sequence[float], delays_ticks: Sequence[int], channels: Sequence[str]) -> list[Point]:
     """The conditions of the study; lossless is the reference of each axis and always there."""
-    line = Scenario()
+    line = StudyScenario()
     found = [Point("loss 0", "loss", 0.0, line, None, is_reference=True)]
     found += [Point(f"loss {p:g}", "loss", p, line, lossy(p)) for p in losses if p]
     ticks = [d for d in delays_ticks if d]
@@ -36,7 +36,7 @@ def points(losses: Sequence[float], delays_ticks: Sequence[int], channels: Seque
     found += [Point(f"delay {d} ticks", "delay_ticks", float(d), line, Air(delay_ticks=d)) for d in ticks]
     for name in channels:
         what, air, graph = CHANNELS[name]
-        found.append(Point(what, f"channel {name}", None, Scenario(graph), air))
+        found.append(Point(what, f"channel {name}", None, StudyScenario(graph), air))
     return found
 
 
@@ -46,7 +46,7 @@ def loss(
 ) -> dict[str, Any]:  # fmt: skip
     """Fly all conditions, print the tables with the genie beside the flagship, return (and draw) all figures."""
     flown = fly(points(losses, delays_ticks, channels), methods, runs=runs, seed=seed, jobs=jobs, link_seed=link_seed)
-    show(flown, f"{runs} runs, steady t = {STEADY_FROM}..{Scenario().samples} (mean ± standard error over runs)")
+    show(flown, f"{runs} runs, steady t = {STEADY_FROM}..{StudyScenario().samples} (mean ± standard error over runs)")
     if GENIE in methods and FLAGSHIP in methods:
         _beside_the_genie(flown)
     if out is not None:

@@ -21,8 +21,8 @@ from fleetloc.output import print_table, progress_bar
 from sim_bridge.studies.air import Air, channel_seed
 from sim_bridge.studies.flown import fly_recording
 from sim_bridge.studies.monte_carlo import Hangar
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from transport.link.channel import LinkFaults
 
 Floats = NDArray[np.float64]
@@ -32,7 +32,7 @@ AGREED = 1.2
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class PartitionPlan:
     """When the fleet falls apart, for how long, and how long it is watched afterwards."""
 
     settings: EstimatorSettings
@@ -56,10 +56,12 @@ class Plan:
         """First tick of the partition, first after it."""
         return round(self.begin_s / self.period_s), round((self.begin_s + self.length_s) / self.period_s)
 
-    def recording(self, run: int, *, cut: bool) -> Recording:
+    def recording(self, run: int, *, cut: bool) -> StudyInput:
         """What is measured in a run; with the cut no ranges between the islands, if they are out of sight."""
         ticks = self.cut[1] + round(self.after_s / self.period_s)
-        recording = Scenario(self.graph, ticks, self.period_s, turn_every_s=self.turn_every_s).record(self.seed, run)
+        recording = StudyScenario(self.graph, ticks, self.period_s, turn_every_s=self.turn_every_s).record(
+            self.seed, run
+        )
         if not (cut and self.ranges_cut):
             return recording
         inside = np.isin(np.arange(len(recording.agents)), self.island)
@@ -73,7 +75,7 @@ class Plan:
 
 
 @dataclass(frozen=True, slots=True)
-class Outcome:
+class PartitionOutcome:
     """One run, cut and clean; arrays over ticks ``(T+1,)``."""
 
     anees: tuple[Floats, Floats]
@@ -88,7 +90,7 @@ class Outcome:
     """Share of ticks with an estimate in time, of the run with the cut."""
 
 
-def fly_once(plan: Plan, run: int) -> Outcome:
+def fly_once(plan: PartitionPlan, run: int) -> PartitionOutcome:
     """One run with the partition and without."""
     whole, seed = plan.recording(run, cut=False), channel_seed(plan.seed, run)
     flown_whole = fly_recording(whole, plan.settings, plan.air(cut=False), seed=seed)
@@ -99,7 +101,7 @@ def fly_once(plan: Plan, run: int) -> Outcome:
     truth = whole.truth.reshape(len(whole.truth), 1, -1)
     ins = list(plan.island)
     outs = [slot for slot in range(len(whole.agents)) if slot not in ins]
-    return Outcome(
+    return PartitionOutcome(
         (parted.nees_full[:, ins].mean(axis=1), parted.nees_full[:, outs].mean(axis=1)),
         between(parted.mean, ins, outs),
         between(clean.mean, ins, outs),
@@ -122,7 +124,7 @@ def agrees_after(ratio: Floats, healed: int) -> int | None:
     return first if healed + first < len(ratio) else None
 
 
-def partition(plan: Plan, *, runs: int, jobs: int, out: Path | None = None) -> dict[str, Any]:
+def partition(plan: PartitionPlan, *, runs: int, jobs: int, out: Path | None = None) -> dict[str, Any]:
     """Fly the runs, print when islands were inconsistent and when they agree again, return the figures."""
     with Hangar(min(jobs, runs)) as hangar, progress_bar("runs", runs) as advance:
         outcomes = []
@@ -142,7 +144,7 @@ def partition(plan: Plan, *, runs: int, jobs: int, out: Path | None = None) -> d
     return results
 
 
-def figures(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
+def figures(plan: PartitionPlan, outcomes: Sequence[PartitionOutcome]) -> dict[str, Any]:
     """ANEES of the islands while cut and after, errors, and how long after healing they agree.
 
     ANEES per tick is the mean over runs and members; the largest of these, and of their means over a second.
@@ -179,7 +181,9 @@ def figures(plan: Plan, outcomes: Sequence[Outcome]) -> dict[str, Any]:
     return results
 
 
-def _curves(plan: Plan, outcomes: Sequence[Outcome]) -> tuple[Floats, dict[str, Floats], dict[str, Floats]]:
+def _curves(
+    plan: PartitionPlan, outcomes: Sequence[PartitionOutcome]
+) -> tuple[Floats, dict[str, Floats], dict[str, Floats]]:
     """Time, ANEES per island and disagreement (cut, clean), over the runs."""
     anees: dict[str, Floats] = {
         name: np.mean([outcome.anees[which] for outcome in outcomes], axis=0)

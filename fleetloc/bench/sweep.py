@@ -11,7 +11,7 @@ from fleetloc.bench.methods import CENTRALISED
 from fleetloc.output import print_table, progress_bar, with_error
 from sim_bridge.studies.air import Air
 from sim_bridge.studies.monte_carlo import Hangar, Method, Sample, accuracy_row, ratio_of_means, run_study
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_scenario import StudyScenario
 
 STEADY_FROM = 41
 """First sample that counts as steady (of 70)."""
@@ -26,7 +26,7 @@ class Point:
     name: str
     axis: str
     value: float | None
-    scenario: Scenario
+    scenario: StudyScenario
     air: Air | None = None
     is_reference: bool = False
     """The other points of its axis are compared with it, run by run."""

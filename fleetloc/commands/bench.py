@@ -11,7 +11,7 @@ from fleetloc.bench.fusion_command import fusion
 
 if TYPE_CHECKING:
     from fleetloc.bench.sweep import Point
-    from sim_bridge.studies.study_scenario import Scenario
+    from sim_bridge.studies.study_scenario import StudyScenario
 
 Runs = Annotated[int, typer.Option(min=1, help="Monte Carlo runs, the same for all methods.")]
 Seed = Annotated[int, typer.Option(min=0, help="Of all random draws.")]
@@ -98,7 +98,7 @@ def accuracy(
     from fleetloc.bench.accuracy import accuracy as study
     from fleetloc.bench.methods import chosen, default_methods
     from fleetloc.errors import InputError
-    from sim_bridge.studies.study_scenario import GRAPHS, Scenario
+    from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario
 
     if graph not in GRAPHS:
         raise InputError("--graph", "", f"one of {', '.join(GRAPHS)}", graph)
@@ -106,7 +106,7 @@ def accuracy(
         raise InputError("--blind", "", f"at most {GRAPHS[graph][0]} agents", str(blind))
     if start == "paper" and start_offsets:
         raise InputError("--start-offsets", "", "the good start", "the paper's")
-    scenario = Scenario(graph, samples, period, start, blind)
+    scenario = StudyScenario(graph, samples, period, start, blind)
     sweeps = _sweeps(scenario, agents, family, gps_shares, start_offsets)
     selected = chosen(default_methods(other_accel_variance), methods)
     folder = _prepare(out)
@@ -116,7 +116,7 @@ def accuracy(
     _write(results, folder, json_file)
 
 
-def _sweeps(scenario: Scenario, agents: str, family: str, gps_shares: str, start_offsets: str) -> list[Point]:
+def _sweeps(scenario: StudyScenario, agents: str, family: str, gps_shares: str, start_offsets: str) -> list[Point]:
     from fleetloc.bench.accuracy import sweep_points
 
     return sweep_points(
@@ -195,11 +195,11 @@ def partition(
 ) -> None:
     """A mesh of five falls apart into two and three and heals: are islands consistent, when do they agree again."""
     from estimators.settings import default_settings
-    from fleetloc.bench.partition import Plan
+    from fleetloc.bench.partition import PartitionPlan
     from fleetloc.bench.partition import partition as study
 
     turn_every_s = 5.0 if moving else None
-    plan = Plan(
+    plan = PartitionPlan(
         default_settings(), seed, length_s=length, turn_every_s=turn_every_s, ranges_cut=not keep_ranges, loss=loss
     )
     folder = _prepare(out)

@@ -11,7 +11,7 @@ from fleetloc.options import Overrides
 
 if TYPE_CHECKING:
     from sim_bridge.studies.lockstep import LockstepResult
-    from sim_bridge.studies.recording import Recording
+    from sim_bridge.studies.study_input import StudyInput
 
 
 def register(app: typer.Typer) -> None:
@@ -20,7 +20,7 @@ def register(app: typer.Typer) -> None:
 
 
 def estimate(
-    recording: Annotated[Path, typer.Argument(help="Recording (.npz), see docs/replay.md.")],
+    recording: Annotated[Path, typer.Argument(help="Study input (.npz), see docs/replay.md.")],
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file; only its [estimator] table is read.")
     ] = None,
@@ -35,7 +35,7 @@ def estimate(
     from fleetloc.output import progress_bar, write_json
     from fleetloc.warmup import announce
     from sim_bridge.studies.lockstep import run_lockstep
-    from sim_bridge.studies.recording import load_recording
+    from sim_bridge.studies.study_input import load_recording
 
     settings = load_estimator_settings(config, overrides or [])
     fleet = load_recording(recording)
@@ -57,7 +57,7 @@ def _write(path: Path, result: LockstepResult) -> None:
         np.savez_compressed(file, mean=result.mean, cov_diag=result.cov_diag, status=result.status)
 
 
-def _figures(recording: Recording, result: LockstepResult) -> dict[str, Any]:
+def _figures(recording: StudyInput, result: LockstepResult) -> dict[str, Any]:
     """What there is to say about a run, per agent, with units in the keys."""
     import numpy as np
 
@@ -82,7 +82,7 @@ def _figures(recording: Recording, result: LockstepResult) -> dict[str, Any]:
     return {"ticks": recording.ticks + 1, "agents": agents, "late_records_dropped": int(result.dropped.sum())}
 
 
-def _print(recording: Recording, figures: dict[str, Any]) -> None:
+def _print(recording: StudyInput, figures: dict[str, Any]) -> None:
     from fleetloc.output import print_table
 
     known = recording.truth is not None

@@ -29,8 +29,8 @@ from estimators.model.layout import Layout
 from estimators.model.measurements import Matrix, Vector
 from estimators.settings import EstimatorSettings
 from sim_bridge.studies.air import Air
-from sim_bridge.studies.lockstep import LockstepResult, RunRecord
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.lockstep import LockstepResult, StudyEstimates
+from sim_bridge.studies.study_input import StudyInput
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.virtual_fleet import VirtualDrone, VirtualFleet
 from transport.messages.measurement_body import Measurements
@@ -72,7 +72,7 @@ class FlownResult:
 class KnowledgeTap:
     """Follows who could know whose records of which tick, had packets of records carried all that was known."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: StudyInput) -> None:
         self._agents = tuple(int(a) for a in recording.agents)
         ticks, n = recording.ticks + 1, len(self._agents)
         self._known = np.zeros((n, ticks, n), np.bool_)
@@ -105,7 +105,7 @@ class KnowledgeTap:
 class _Sensors:
     """What one drone's sensors say, tick by tick."""
 
-    recording: Recording
+    recording: StudyInput
     slot: int
 
     def samples(self, tick: int, t_s: float) -> list[Sample]:
@@ -155,7 +155,7 @@ class _FirstEstimate:
 
 
 def fly_recording(
-    recording: Recording,
+    recording: StudyInput,
     settings: EstimatorSettings,
     air: Air | None = None,
     *,
@@ -163,10 +163,10 @@ def fly_recording(
     progress: Callable[[int], None] | None = None,
 ) -> FlownResult:
     """Fly a study input; ``seed`` is of the channels. Results repeat bit by bit."""
-    return _StudyFlight(recording, settings, air or Air(), seed, progress).fly()
+    return _FlownRun(recording, settings, air or Air(), seed, progress).fly()
 
 
-def config_of(recording: Recording, settings: EstimatorSettings) -> FleetConfig:
+def config_of(recording: StudyInput, settings: EstimatorSettings) -> FleetConfig:
     """The configuration of a fleet that flies an input: its sensors' bounds, its edges, nobody to sign."""
     ids = [int(agent) for agent in recording.agents]
     half = recording.gps_half_width
@@ -198,12 +198,12 @@ def config_of(recording: Recording, settings: EstimatorSettings) -> FleetConfig:
     return config_from(document, "study")
 
 
-class _StudyFlight:
+class _FlownRun:
     """One flight."""
 
     def __init__(
         self,
-        recording: Recording,
+        recording: StudyInput,
         settings: EstimatorSettings,
         air: Air,
         seed: int,
@@ -228,7 +228,7 @@ class _StudyFlight:
         shape = recording.ticks + 1, len(ids)
         self._last = [self._before(slot) for slot in range(len(ids))]
         self._available = np.zeros(shape, np.bool_)
-        self._record = RunRecord(recording, centralised=False)
+        self._record = StudyEstimates(recording, centralised=False)
         self._written = np.zeros(len(ids), int)
 
     def _before(self, slot: int) -> Estimate:

@@ -21,7 +21,7 @@ from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix
 from estimators.settings import EstimatorSettings, fade_per_tick
 from estimators.window.history import MeasurementWindow
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_input import StudyInput
 
 RELINEARISE = 1e-4
 """Movement of a tick's state, m or m/s, from which on its rows are linearised anew: an error of its square."""
@@ -35,7 +35,7 @@ Floats = NDArray[np.float64]
 class FullInformationSmoother:
     """One agent's smoother; it starts from the agent's own first estimate in the recording."""
 
-    def __init__(self, recording: Recording, settings: EstimatorSettings, slot: int) -> None:
+    def __init__(self, recording: StudyInput, settings: EstimatorSettings, slot: int) -> None:
         layout = Layout(tuple(int(a) for a in recording.agents))
         ticks, n = recording.ticks + 1, layout.dimension
         self._window = MeasurementWindow(

@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 from estimators.model.measurements import InputTable, RowTable, empty_inputs, empty_rows
 from estimators.settings import EstimatorSettings
 from sim_bridge.studies.full_information import FullInformationSmoother
-from sim_bridge.studies.lockstep import LockstepResult, RunRecord, own_input, own_rows
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.lockstep import LockstepResult, StudyEstimates, own_input, own_rows
+from sim_bridge.studies.study_input import StudyInput
 
 Bools = NDArray[np.bool_]
 
@@ -37,7 +37,7 @@ class Genie:
     settings: EstimatorSettings
 
     def run(
-        self, recording: Recording, heard: Bools, progress: Callable[[int], None] | None = None
+        self, recording: StudyInput, heard: Bools, progress: Callable[[int], None] | None = None
     ) -> LockstepResult:
         """The genie of every agent; the same result as of an estimator's run.
 
@@ -46,7 +46,7 @@ class Genie:
         """
         n = len(recording.agents)
         fleet = [FullInformationSmoother(recording, self.settings, slot) for slot in range(n)]
-        record = RunRecord(recording, centralised=False)
+        record = StudyEstimates(recording, centralised=False)
         had = np.zeros(heard.shape[1:], np.bool_)
         pushed = np.zeros_like(had)
         for tick, now in enumerate(heard):
@@ -63,13 +63,13 @@ class Genie:
         return record.result([0] * n)
 
 
-def _rows(recording: Recording, which: Bools) -> RowTable:
+def _rows(recording: StudyInput, which: Bools) -> RowTable:
     """The rows of some (tick, owner)."""
     tables = [own_rows(recording, int(tick), int(owner)) for tick, owner in np.argwhere(which)]
     return np.concatenate([empty_rows(), *tables])
 
 
-def _inputs(recording: Recording, which: Bools) -> InputTable:
+def _inputs(recording: StudyInput, which: Bools) -> InputTable:
     """The accelerations from some ticks to the next, of some owners."""
     tables = [own_input(recording, int(tick) + 1, int(owner)) for tick, owner in np.argwhere(which)]
     return np.concatenate([empty_inputs(), *tables])

@@ -27,8 +27,8 @@ from estimators.model.measurements import (
     speed_row,
 )
 from estimators.settings import EstimatorSettings
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.relay import Arrival, RecordRelay, adjacency
+from sim_bridge.studies.relay import Arrival, MeasurementRelay, adjacency
+from sim_bridge.studies.study_input import StudyInput
 
 Floats = NDArray[np.float64]
 
@@ -51,7 +51,7 @@ class LockstepResult:
     nees_own: Floats | None
 
 
-def own_rows(recording: Recording, tick: int, slot: int) -> RowTable:
+def own_rows(recording: StudyInput, tick: int, slot: int) -> RowTable:
     """What one agent's sensors said at a tick; bounds are those of the recording's uniform noises."""
     tables = []
     gps, half = recording.gps[tick, slot], recording.gps_half_width
@@ -66,14 +66,14 @@ def own_rows(recording: Recording, tick: int, slot: int) -> RowTable:
     return np.concatenate(tables) if tables else empty_rows()
 
 
-def own_input(recording: Recording, tick: int, slot: int) -> InputTable:
+def own_input(recording: StudyInput, tick: int, slot: int) -> InputTable:
     """The acceleration of one agent over the tick that ends at ``tick``; none at the first."""
     if tick == 0:
         return empty_inputs()
     return input_rows(tick - 1, slot, recording.accel[tick - 1, slot], recording.accel_half_width**2 / 3)
 
 
-def neighbours(recording: Recording) -> list[list[int]]:
+def neighbours(recording: StudyInput) -> list[list[int]]:
     """Neighbours of every agent, sorted."""
     found: list[set[int]] = [set() for _ in recording.agents]
     for a, b in recording.edges.tolist():
@@ -85,7 +85,7 @@ def neighbours(recording: Recording) -> list[list[int]]:
 class Links:
     """Which packets of a recording reach whom within the tick that they are sent in."""
 
-    def __init__(self, recording: Recording) -> None:
+    def __init__(self, recording: StudyInput) -> None:
         self._on_time = recording.received & adjacency(recording) & (recording.delay_ticks == 0)
 
     def heard(self, tick: int, receiver: int) -> list[int]:
@@ -94,7 +94,7 @@ class Links:
 
 
 def run_lockstep(
-    recording: Recording, settings: EstimatorSettings, progress: Callable[[int], None] | None = None
+    recording: StudyInput, settings: EstimatorSettings, progress: Callable[[int], None] | None = None
 ) -> LockstepResult:
     """Run one estimator per agent (or one for all, if centralised) over a recording.
 
@@ -107,8 +107,8 @@ def run_lockstep(
         make_estimator(settings, layout, slot, recording.x0[slot], recording.P0, recording.period_s) for slot in slots
     ]
     links = Links(recording)
-    relay = RecordRelay(recording, settings)
-    record = RunRecord(recording, centralised)
+    relay = MeasurementRelay(recording, settings)
+    record = StudyEstimates(recording, centralised)
     for tick in range(recording.ticks + 1):
         arrivals = relay.exchange(tick)
         for slot, estimator in enumerate(fleet):
@@ -128,7 +128,7 @@ def run_lockstep(
     return record.result([estimator.dropped for estimator in fleet])
 
 
-def records_of(recording: Recording, pairs: Iterable[tuple[int, int]]) -> tuple[RowTable, InputTable]:
+def records_of(recording: StudyInput, pairs: Iterable[tuple[int, int]]) -> tuple[RowTable, InputTable]:
     """Rows and inputs of some (tick, slot)."""
     found = list(pairs)
     rows = [own_rows(recording, tick, slot) for tick, slot in found]
@@ -137,7 +137,7 @@ def records_of(recording: Recording, pairs: Iterable[tuple[int, int]]) -> tuple[
 
 
 def _received(
-    recording: Recording, settings: EstimatorSettings, arrivals: list[Arrival]
+    recording: StudyInput, settings: EstimatorSettings, arrivals: list[Arrival]
 ) -> tuple[RowTable, InputTable]:
     """Rows and inputs of what arrived; an input travels as far as the settings share it."""
     reach = {"none": 0, "neighbours": 1, "fleet": len(recording.agents)}[settings.share_inputs]
@@ -146,10 +146,10 @@ def _received(
     return np.concatenate(rows), np.concatenate(inputs)
 
 
-class RunRecord:
+class StudyEstimates:
     """Collects the estimates of a run."""
 
-    def __init__(self, recording: Recording, centralised: bool) -> None:
+    def __init__(self, recording: StudyInput, centralised: bool) -> None:
         self._truth = None if recording.truth is None else recording.truth.reshape(recording.ticks + 1, -1)
         self._centralised = centralised
         ticks, n = recording.ticks + 1, len(recording.agents)

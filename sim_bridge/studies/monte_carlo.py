@@ -19,8 +19,8 @@ from sim_bridge.studies.air import Air, channel_seed
 from sim_bridge.studies.flown import FlownResult, fly_recording
 from sim_bridge.studies.genie import Genie
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 
 Floats = NDArray[np.float64]
 Method = EstimatorSettings | Genie
@@ -60,13 +60,13 @@ class Sample:
         for each in fields(self):
             setattr(self, each.name, getattr(self, each.name) + getattr(other, each.name))
 
-    def add_flown(self, recording: Recording, flown: FlownResult, cpu_s: float) -> None:
+    def add_flown(self, recording: StudyInput, flown: FlownResult, cpu_s: float) -> None:
         """Add a run of the agents that fly."""
         self.add(recording, flown.estimates, cpu_s)
         self.available.append(flown.available)
         self.bytes_per_s.append(flown.bytes_per_s)
 
-    def add(self, recording: Recording, result: LockstepResult, cpu_s: float) -> None:
+    def add(self, recording: StudyInput, result: LockstepResult, cpu_s: float) -> None:
         """Add a run."""
         assert recording.truth is not None
         assert result.nees_full is not None
@@ -102,10 +102,10 @@ def _others(error: Floats) -> Floats:
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class StudyFlight:
     """One run of a study, to be flown by every method; a function of these values alone."""
 
-    scenario: Scenario
+    scenario: StudyScenario
     methods: Mapping[str, Method]
     seed: int
     run: int
@@ -141,7 +141,7 @@ def _since(begun: float) -> float:
 class _FlownOnce:
     """The flights of one run, each flown once: the genie wants to know what reached whom in them."""
 
-    def __init__(self, flight: Flight, recording: Recording) -> None:
+    def __init__(self, flight: StudyFlight, recording: StudyInput) -> None:
         self._flight, self._recording = flight, recording
         self._flown: dict[EstimatorSettings, FlownResult] = {}
 
@@ -179,7 +179,7 @@ class Hangar:
 
 
 def run_study(
-    scenario: Scenario,
+    scenario: StudyScenario,
     methods: Mapping[str, Method],
     runs: int,
     seed: int,
@@ -196,8 +196,8 @@ def run_study(
     seed is ``link_seed`` or else ``seed``. ``hangar`` flies in several processes. Not ``flown``: tick by tick.
     """
     samples = {name: Sample() for name in methods}
-    flights = [Flight(scenario, methods, seed, run, air, link_seed, flown) for run in range(runs)]
-    for of_run in (Hangar() if hangar is None else hangar).map(Flight.fly, flights):
+    flights = [StudyFlight(scenario, methods, seed, run, air, link_seed, flown) for run in range(runs)]
+    for of_run in (Hangar() if hangar is None else hangar).map(StudyFlight.fly, flights):
         for name, sample in of_run.items():
             samples[name].extend(sample)
             if progress is not None:

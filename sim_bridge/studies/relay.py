@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.settings import EstimatorSettings
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_input import StudyInput
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 
 BODY_BYTES = MAX_DATAGRAM_BODY_BYTES
@@ -39,10 +39,10 @@ class Arrival:
     """Links they have travelled: 0 own, 1 from a neighbour's own."""
 
 
-class RecordRelay:
+class MeasurementRelay:
     """The exchange of records of one run."""
 
-    def __init__(self, recording: Recording, settings: EstimatorSettings) -> None:
+    def __init__(self, recording: StudyInput, settings: EstimatorSettings) -> None:
         self._n = len(recording.agents)
         self._reached = recording.received & adjacency(recording)
         self._delay = recording.delay_ticks
@@ -94,7 +94,7 @@ class RecordRelay:
         return packet
 
 
-def adjacency(recording: Recording) -> NDArray[np.bool_]:
+def adjacency(recording: StudyInput) -> NDArray[np.bool_]:
     """Who is whose neighbour, ``(n, n)``."""
     adjacent = np.zeros((len(recording.agents),) * 2, bool)
     for a, b in recording.edges.tolist():
@@ -102,7 +102,7 @@ def adjacency(recording: Recording) -> NDArray[np.bool_]:
     return adjacent
 
 
-def _record_bytes(recording: Recording) -> NDArray[np.int64]:
+def _record_bytes(recording: StudyInput) -> NDArray[np.int64]:
     """Bytes ``(T+1, n)`` that the records of one agent and tick take in a packet."""
     fixes = np.isfinite(recording.gps[:, :, :3]).all(axis=-1)
     speeds = np.isfinite(recording.gps[:, :, 3])

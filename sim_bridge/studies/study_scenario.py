@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.model.motion import predict_mean
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_input import StudyInput
 from sim_bridge.world.guidance import command, default_path, lqr_gain
 
 Start = Literal["paper", "good"]
@@ -71,7 +71,7 @@ def graph_of(family: str, agents: int) -> str:
 
 
 @dataclass(frozen=True, slots=True)
-class Scenario:
+class StudyScenario:
     """One family of runs; `record` draws a run of it."""
 
     graph: str = "line"
@@ -94,7 +94,7 @@ class Scenario:
         if self.start == "paper" and (self.start_sigma_m is not None or self.start_offset_m):
             raise ValueError("start: expected the good start with a spread or an offset, found the paper's")
 
-    def record(self, seed: int, run: int) -> Recording:
+    def record(self, seed: int, run: int) -> StudyInput:
         """The recording of one run, a function of ``seed`` and ``run`` alone."""
         rng = np.random.default_rng([seed, run])
         n, edges = GRAPHS[self.graph]
@@ -106,7 +106,7 @@ class Scenario:
         if self.blind:
             gps[:, n - self.blind :] = np.nan
         x0, p0 = self._start(rng, truth[0])
-        return Recording(
+        return StudyInput(
             period_s=self.period_s,
             agents=np.arange(1, n + 1),
             edges=np.array(edges, np.int64),

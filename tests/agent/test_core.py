@@ -14,7 +14,7 @@ from tests.support.circling_fleet import CirclingFleet
 from tests.support.notebook_estimator import MakeConfig, Notebook, fix, lone, received, tick_through
 from tests.support.onboard import CONNECTED, onboard_of
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements, PositionRecord
+from transport.messages.measurement_body import Measurements, PositionMeasurement
 
 # --- one core ----------------------------------------------------------------------------------------------
 
@@ -126,7 +126,7 @@ def test_measurements_are_waited_for_until_they_come_or_their_time_is_over(make_
     core.on_packet(received(2, Measurements(999, ())), 100.01)
     core.advance(100.112, CONNECTED)
     assert made == []  # neighbour 2 is heard, its tick 1000 is not there yet
-    record = PositionRecord(2, 1000, (1, 2, 3), (1, 1, 1))
+    record = PositionMeasurement(2, 1000, (1, 2, 3), (1, 1, 1))
     core.on_packet(received(2, Measurements(1000, (record,))), 100.113)
     [second] = core.advance(100.113, CONNECTED)
     assert isinstance(second, Tell)  # the first exchange is complete
@@ -234,7 +234,9 @@ def test_a_neighbour_with_a_wrong_clock_harms_nobody(make_config: MakeConfig) ->
     for k in range(30):
         now_s = 100.0 + 0.01 * k
         wrong = 5000 + k
-        core.on_packet(received(2, Measurements(wrong, (PositionRecord(2, wrong, (1, 2, 3), (1, 1, 1)),))), now_s)
+        core.on_packet(
+            received(2, Measurements(wrong, (PositionMeasurement(2, wrong, (1, 2, 3), (1, 1, 1)),))), now_s
+        )
         core.on_packet(received(2, information(wrong)), now_s)
         core.advance(now_s, CONNECTED)
     assert core.records.refused["heard: of the future"] == 30

@@ -24,7 +24,7 @@ from transport.link.session import Handlers, Session, open_session
 from transport.link.session_settings import SessionSettings, TlsSettings, zenoh_config
 from transport.link.streams import Stream, key_expression
 from transport.messages.clock_body import ClockAnswer, decode_clock_question
-from transport.messages.measurement_body import Measurements, SpeedRecord
+from transport.messages.measurement_body import Measurements, SpeedMeasurement
 from transport.messages.uwb_body import UwbFrame, UwbRange, encode_uwb_json
 from transport.security.certificate_files import Member, authority_path
 from transport.security.certificates import issue, make_authority
@@ -107,7 +107,7 @@ def dialling(config: FleetConfig, base: Path, agent_id: int) -> SessionSettings:
 
 
 def measurements(tick: int) -> Measurements:
-    return Measurements(tick, (SpeedRecord(2, tick, 1.5, 0.25),))
+    return Measurements(tick, (SpeedMeasurement(2, tick, 1.5, 0.25),))
 
 
 class Voice:

@@ -26,8 +26,8 @@ from estimators.model.measurements import (
 )
 from estimators.window.history import MeasurementWindow
 from estimators.window.types import WindowProblem
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import dense_reference as dense
 
 Array = NDArray[np.float64]
@@ -136,7 +136,7 @@ def random_window(
     return problem, states
 
 
-def noiseless(recording: Recording) -> Recording:
+def noiseless(recording: StudyInput) -> StudyInput:
     """The same flight, measured exactly, with the true start at every agent; needs the truth.
 
     Half widths (and so the assumed variances) stay as they are. Ranges and speeds are the smoothed norms of
@@ -156,9 +156,9 @@ def noiseless(recording: Recording) -> Recording:
     return replace(recording, accel=accel, gps=gps, ranges=ranges, x0=x0)
 
 
-def recording_arrays(recording: Recording | None = None) -> dict[str, Any]:
+def recording_arrays(recording: StudyInput | None = None) -> dict[str, Any]:
     """The arrays of a (small) recording, to be spoiled by a test."""
-    made = Scenario(samples=4).record(1, 0) if recording is None else recording
+    made = StudyScenario(samples=4).record(1, 0) if recording is None else recording
     names = made.__dataclass_fields__
     return {name: getattr(made, name) for name in names if getattr(made, name) is not None}
 

@@ -7,18 +7,18 @@ from dataclasses import replace
 
 import numpy as np
 
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_input import StudyInput
 
 
-def with_loss(recording: Recording, probability: float, rng: np.random.Generator) -> Recording:
+def with_loss(recording: StudyInput, probability: float, rng: np.random.Generator) -> StudyInput:
     """Every packet of every directed link is lost independently with ``probability`` (Bernoulli)."""
     kept = rng.random(recording.received.shape) >= probability
     return replace(recording, received=recording.received & kept)
 
 
 def with_delay(
-    recording: Recording, ticks: int, spread_ticks: int = 0, rng: np.random.Generator | None = None
-) -> Recording:
+    recording: StudyInput, ticks: int, spread_ticks: int = 0, rng: np.random.Generator | None = None
+) -> StudyInput:
     """Every packet comes ``ticks`` late, or uniformly up to ``spread_ticks`` later still (which reorders them)."""
     shape = recording.delay_ticks.shape
     more = rng.integers(0, spread_ticks + 1, shape) if rng is not None and spread_ticks else np.zeros(shape, np.int64)
@@ -26,8 +26,8 @@ def with_delay(
 
 
 def with_partition(
-    recording: Recording, island: Sequence[int], first: int, last: int, *, ranges: bool = False
-) -> Recording:
+    recording: StudyInput, island: Sequence[int], first: int, last: int, *, ranges: bool = False
+) -> StudyInput:
     """No packet crosses between the slots of ``island`` and the others in ticks first..last-1.
 
     With ``ranges`` no range is measured between them either (a hill instead of a jammed channel).
@@ -42,7 +42,7 @@ def with_partition(
     return replace(recording, received=received, ranges=measured)
 
 
-def with_one_way(recording: Recording, receiver: int, sender: int) -> Recording:
+def with_one_way(recording: StudyInput, receiver: int, sender: int) -> StudyInput:
     """Nothing that ``sender`` sends reaches ``receiver``; the other direction is as before."""
     received = recording.received.copy()
     received[:, receiver, sender] = False

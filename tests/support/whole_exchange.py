@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from sim_bridge.studies.recording import Recording
 from sim_bridge.studies.relay import adjacency
+from sim_bridge.studies.study_input import StudyInput
 
 
-def heard_of(recording: Recording, exchanges: int) -> NDArray[np.bool_]:
+def heard_of(recording: StudyInput, exchanges: int) -> NDArray[np.bool_]:
     """By the estimate of each tick ``(T+1, n, T+1, n)``: of receiver, tick and owner of the records.
 
     ``exchanges`` packets follow each other on every link in a tick; links are as the input says.

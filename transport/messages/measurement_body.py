@@ -33,7 +33,7 @@ MAX_RANGE_M = 1e5
 MAX_ACCEL_MPS2 = 1e4
 
 
-class RecordKind(IntEnum):
+class MeasurementKind(IntEnum):
     """First byte of a record on the wire."""
 
     POSITION = 1
@@ -45,7 +45,7 @@ class RecordKind(IntEnum):
 
 
 @dataclass(frozen=True, slots=True)
-class PositionRecord:
+class PositionMeasurement:
     """A position fix of ``observer``: NED m, variances m2 and hard bounds m per axis (inf = none).
 
     ``offset_s`` is the instant of the measurement minus the time of ``tick``, here and below.
@@ -60,7 +60,7 @@ class PositionRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class VelocityRecord:
+class VelocityMeasurement:
     """A velocity of ``observer``: NED m/s, variances (m/s)2 and hard bounds m/s per axis (inf = none)."""
 
     observer: int
@@ -72,7 +72,7 @@ class VelocityRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class SpeedRecord:
+class SpeedMeasurement:
     """The norm of ``observer``'s velocity as measured, m/s (noise can make it negative)."""
 
     observer: int
@@ -84,7 +84,7 @@ class SpeedRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class RangeRecord:
+class RangeMeasurement:
     """The range from ``observer`` to agent ``other`` as measured, m."""
 
     observer: int
@@ -97,7 +97,7 @@ class RangeRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class AnchorRangeRecord:
+class AnchorRangeMeasurement:
     """The range from ``observer`` to a fixed anchor at ``anchor_m`` (NED m) as measured, m."""
 
     observer: int
@@ -110,7 +110,7 @@ class AnchorRangeRecord:
 
 
 @dataclass(frozen=True, slots=True)
-class AccelerationRecord:
+class AccelerationMeasurement:
     """The acceleration of ``observer`` averaged over ``tick`` to ``tick + 1``: NED m/s2, gravity removed."""
 
     observer: int
@@ -119,23 +119,30 @@ class AccelerationRecord:
     variance_m2ps4: Triple
 
 
-Record = PositionRecord | VelocityRecord | SpeedRecord | RangeRecord | AnchorRangeRecord | AccelerationRecord
+Measurement = (
+    PositionMeasurement
+    | VelocityMeasurement
+    | SpeedMeasurement
+    | RangeMeasurement
+    | AnchorRangeMeasurement
+    | AccelerationMeasurement
+)
 
 _KIND_OF = {
-    PositionRecord: RecordKind.POSITION,
-    VelocityRecord: RecordKind.VELOCITY,
-    SpeedRecord: RecordKind.SPEED,
-    RangeRecord: RecordKind.RANGE,
-    AnchorRangeRecord: RecordKind.ANCHOR_RANGE,
-    AccelerationRecord: RecordKind.ACCELERATION,
+    PositionMeasurement: MeasurementKind.POSITION,
+    VelocityMeasurement: MeasurementKind.VELOCITY,
+    SpeedMeasurement: MeasurementKind.SPEED,
+    RangeMeasurement: MeasurementKind.RANGE,
+    AnchorRangeMeasurement: MeasurementKind.ANCHOR_RANGE,
+    AccelerationMeasurement: MeasurementKind.ACCELERATION,
 }
 _LAYOUT: dict[int, struct.Struct] = {
-    RecordKind.POSITION: struct.Struct("<BHBf3f3e3e"),
-    RecordKind.VELOCITY: struct.Struct("<BHBf3f3e3e"),
-    RecordKind.SPEED: struct.Struct("<BHBffee"),
-    RecordKind.RANGE: struct.Struct("<BHBfHfee"),
-    RecordKind.ANCHOR_RANGE: struct.Struct("<BHBf3ffee"),
-    RecordKind.ACCELERATION: struct.Struct("<BHB3f3e"),
+    MeasurementKind.POSITION: struct.Struct("<BHBf3f3e3e"),
+    MeasurementKind.VELOCITY: struct.Struct("<BHBf3f3e3e"),
+    MeasurementKind.SPEED: struct.Struct("<BHBffee"),
+    MeasurementKind.RANGE: struct.Struct("<BHBfHfee"),
+    MeasurementKind.ANCHOR_RANGE: struct.Struct("<BHBf3ffee"),
+    MeasurementKind.ACCELERATION: struct.Struct("<BHB3f3e"),
 }
 _SINGLE, _SINGLES = struct.Struct("<f"), struct.Struct("<3f")
 _HALF, _HALF_BITS = struct.Struct("<e"), struct.Struct("<H")
@@ -150,7 +157,7 @@ class Measurements:
     """
 
     tick: int
-    records: tuple[Record, ...]
+    records: tuple[Measurement, ...]
     exchange: int = 0
 
 
@@ -163,18 +170,18 @@ class EncodedMeasurements:
     left_out: int
 
 
-def identity(record: Record) -> tuple[RecordKind, int, int, int, float, Triple | None]:
+def identity(record: Measurement) -> tuple[MeasurementKind, int, int, int, float, Triple | None]:
     """What makes two records the same measurement, however often and by whomever it was sent.
 
     (kind, observer, other or 0, tick, offset as on the wire, anchor as on the wire).
     """
-    other = record.other if isinstance(record, RangeRecord) else 0
-    offset = 0.0 if isinstance(record, AccelerationRecord) else _single(record.offset_s)
-    anchor = _singles(record.anchor_m) if isinstance(record, AnchorRangeRecord) else None
+    other = record.other if isinstance(record, RangeMeasurement) else 0
+    offset = 0.0 if isinstance(record, AccelerationMeasurement) else _single(record.offset_s)
+    anchor = _singles(record.anchor_m) if isinstance(record, AnchorRangeMeasurement) else None
     return _KIND_OF[type(record)], record.observer, other, record.tick, offset, anchor
 
 
-def as_sent(record: Record) -> Record:
+def as_sent(record: Measurement) -> Measurement:
     """The record with its numbers rounded as a receiver will see them; raises `EncodeError`.
 
     An agent that uses this for its own estimate works on the same numbers as everybody else. A record too
@@ -183,7 +190,7 @@ def as_sent(record: Record) -> Record:
     encoded = _encode_record(record, record.tick)
     if encoded is None:
         return record
-    ids = (record.observer, record.other) if isinstance(record, RangeRecord) else (record.observer,)
+    ids = (record.observer, record.other) if isinstance(record, RangeMeasurement) else (record.observer,)
     return _record_from(_LAYOUT[_KIND_OF[type(record)]].unpack(encoded), record.tick, ids)
 
 
@@ -212,7 +219,7 @@ def decode_measurements(
     body: bytes, *, tick: int, count: int, roster: Collection[int], exchange: int = 0
 ) -> Measurements:
     """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good."""
-    records: list[Record] = []
+    records: list[Measurement] = []
     at = 0
     for _ in range(count):
         try:
@@ -249,7 +256,7 @@ def _half_up(value: float) -> float:
     return rounded
 
 
-def _encode_record(record: Record, packet_tick: int) -> bytes | None:
+def _encode_record(record: Measurement, packet_tick: int) -> bytes | None:
     """Bytes of a record, ``None`` if it is too old or too uncertain to be worth any."""
     age = packet_tick - record.tick
     if record.tick < 0 or age < 0:
@@ -268,31 +275,33 @@ def _encode_record(record: Record, packet_tick: int) -> bytes | None:
     sigmas = [_half_up(math.sqrt(variance)) for variance in variances]
     if age > MAX_AGE_TICKS or math.inf in sigmas:
         return None
-    middle: tuple[float, ...] = () if isinstance(record, AccelerationRecord) else (_offset(record),)
-    if isinstance(record, RangeRecord):
+    middle: tuple[float, ...] = () if isinstance(record, AccelerationMeasurement) else (_offset(record),)
+    if isinstance(record, RangeMeasurement):
         middle += (record.other,)
-    elif isinstance(record, AnchorRangeRecord):
+    elif isinstance(record, AnchorRangeMeasurement):
         middle += _anchor(record)
     kind = _KIND_OF[type(record)]
     rounded_widths = [_half_up(half_width) for half_width in half_widths]
     return _LAYOUT[kind].pack(kind, record.observer, age, *middle, *values, *sigmas, *rounded_widths)
 
 
-def _check_ids(record: Record) -> None:
+def _check_ids(record: Measurement) -> None:
     good = MIN_AGENT_ID <= record.observer <= MAX_AGENT_ID
-    if isinstance(record, RangeRecord):
+    if isinstance(record, RangeMeasurement):
         good = good and MIN_AGENT_ID <= record.other <= MAX_AGENT_ID and record.other != record.observer
     if not good:
         raise EncodeError(f"{record}: expected distinct agent ids from {MIN_AGENT_ID} to {MAX_AGENT_ID}")
 
 
-def _offset(record: PositionRecord | VelocityRecord | SpeedRecord | RangeRecord | AnchorRangeRecord) -> float:
+def _offset(
+    record: PositionMeasurement | VelocityMeasurement | SpeedMeasurement | RangeMeasurement | AnchorRangeMeasurement,
+) -> float:
     if not -MAX_OFFSET_S <= record.offset_s <= MAX_OFFSET_S:
         raise EncodeError(f"{record}: offset must be within +-{MAX_OFFSET_S:g} s")
     return record.offset_s
 
 
-def _anchor(record: AnchorRangeRecord) -> Triple:
+def _anchor(record: AnchorRangeMeasurement) -> Triple:
     if not all(-MAX_POSITION_M <= component <= MAX_POSITION_M for component in record.anchor_m):
         raise EncodeError(f"{record}: the anchor must be finite and at most {MAX_POSITION_M:g} m away")
     return record.anchor_m
@@ -301,51 +310,51 @@ def _anchor(record: AnchorRangeRecord) -> Triple:
 _Floats = tuple[float, ...]
 
 
-def _numbers(record: Record) -> tuple[_Floats, float, _Floats, _Floats]:
+def _numbers(record: Measurement) -> tuple[_Floats, float, _Floats, _Floats]:
     """Values, the largest magnitude they may have, variances, half widths."""
     match record:
-        case PositionRecord():
+        case PositionMeasurement():
             return record.position_m, MAX_POSITION_M, record.variance_m2, record.half_width_m
-        case VelocityRecord():
+        case VelocityMeasurement():
             return record.velocity_mps, MAX_SPEED_MPS, record.variance_m2ps2, record.half_width_mps
-        case SpeedRecord():
+        case SpeedMeasurement():
             return (record.speed_mps,), MAX_SPEED_MPS, (record.variance_m2ps2,), (record.half_width_mps,)
-        case RangeRecord() | AnchorRangeRecord():
+        case RangeMeasurement() | AnchorRangeMeasurement():
             return (record.range_m,), MAX_RANGE_M, (record.variance_m2,), (record.half_width_m,)
-        case AccelerationRecord():
+        case AccelerationMeasurement():
             return record.accel_mps2, MAX_ACCEL_MPS2, record.variance_m2ps4, ()
 
 
-def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection[int]) -> Record:
+def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection[int]) -> Measurement:
     kind, observer, tick = fields[0], int(fields[1]), packet_tick - int(fields[2])
     _known(observer, roster)
     if tick < 0:
         raise Rejected(Reason.OUT_OF_RANGE, f"record of tick {tick}")
-    if kind == RecordKind.ACCELERATION:
+    if kind == MeasurementKind.ACCELERATION:
         accel = _bounded(fields[3:6], MAX_ACCEL_MPS2, "acceleration")
-        return AccelerationRecord(observer, tick, _triple(accel), _triple(_variances(fields[6:9])))
+        return AccelerationMeasurement(observer, tick, _triple(accel), _triple(_variances(fields[6:9])))
     offset = _bounded(fields[3:4], MAX_OFFSET_S, "offset")[0]
-    if kind == RecordKind.POSITION:
+    if kind == MeasurementKind.POSITION:
         position = _triple(_bounded(fields[4:7], MAX_POSITION_M, "position"))
         variance = _triple(_variances(fields[7:10]))
-        return PositionRecord(observer, tick, position, variance, _triple(_widths(fields[10:13])), offset)
-    if kind == RecordKind.VELOCITY:
+        return PositionMeasurement(observer, tick, position, variance, _triple(_widths(fields[10:13])), offset)
+    if kind == MeasurementKind.VELOCITY:
         velocity = _triple(_bounded(fields[4:7], MAX_SPEED_MPS, "velocity"))
         variance = _triple(_variances(fields[7:10]))
-        return VelocityRecord(observer, tick, velocity, variance, _triple(_widths(fields[10:13])), offset)
+        return VelocityMeasurement(observer, tick, velocity, variance, _triple(_widths(fields[10:13])), offset)
     sigma, half_width = _variances(fields[-2:-1])[0], _widths(fields[-1:])[0]
-    if kind == RecordKind.SPEED:
+    if kind == MeasurementKind.SPEED:
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]
-        return SpeedRecord(observer, tick, speed, sigma, half_width, offset)
-    if kind == RecordKind.RANGE:
+        return SpeedMeasurement(observer, tick, speed, sigma, half_width, offset)
+    if kind == MeasurementKind.RANGE:
         other = _known(int(fields[4]), roster)
         if other == observer:
             raise Rejected(Reason.OUT_OF_RANGE, f"range of agent {observer} to itself")
         range_m = _bounded(fields[5:6], MAX_RANGE_M, "range")[0]
-        return RangeRecord(observer, tick, other, range_m, sigma, half_width, offset)
+        return RangeMeasurement(observer, tick, other, range_m, sigma, half_width, offset)
     anchor = _triple(_bounded(fields[4:7], MAX_POSITION_M, "anchor"))
     range_m = _bounded(fields[7:8], MAX_RANGE_M, "range")[0]
-    return AnchorRangeRecord(observer, tick, anchor, range_m, sigma, half_width, offset)
+    return AnchorRangeMeasurement(observer, tick, anchor, range_m, sigma, half_width, offset)
 
 
 def _known(agent_id: int, roster: Collection[int]) -> int:

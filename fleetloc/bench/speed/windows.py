@@ -25,7 +25,7 @@ from estimators.window.history import MeasurementWindow
 from estimators.window.types import WindowProblem
 from fleetloc.errors import InputError
 from sim_bridge.studies.lockstep import neighbours, own_input, own_rows
-from sim_bridge.studies.recording import Recording
+from sim_bridge.studies.study_input import StudyInput
 from sim_bridge.studies.study_scenario import (
     ACCEL_HALF_WIDTH,
     ACCEL_LIMIT_MPS2,
@@ -149,7 +149,7 @@ def capture_windows(size: Size, count: int, seed: int) -> list[BenchWindow]:
     return captured
 
 
-def study_recording(size: Size, count: int, seed: int) -> Recording:
+def study_recording(size: Size, count: int, seed: int) -> StudyInput:
     """The flight that `capture_windows` takes ``count`` windows from."""
     rng = np.random.default_rng([seed, size.agents, size.window])
     centers, edges = _fleet(rng, size)
@@ -185,7 +185,7 @@ def _connected(n: int, edges: list[tuple[int, int]]) -> bool:
     return len(reached) == n
 
 
-def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) -> Recording:
+def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) -> StudyInput:
     """Drones on circles about ``centers`` ``(n, 3)`` NED m, with the studies' noises and good start."""
     n = len(centers)
     gain = lqr_gain(PERIOD_S)
@@ -208,7 +208,7 @@ def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) ->
     gps = np.concatenate([truth[:, :, :3], np.linalg.norm(truth[:, :, 3:], axis=-1, keepdims=True)], axis=-1)
     variances = np.tile(GOOD_P0, n)
     everyone = (ticks + 1, n, n)
-    return Recording(
+    return StudyInput(
         period_s=PERIOD_S,
         agents=np.arange(1, n + 1),
         edges=np.array(edges, np.int64),
@@ -229,7 +229,7 @@ def _fly(rng: np.random.Generator, centers: Matrix, edges: Edges, ticks: int) ->
 class _ClosedLoop:
     """One estimator per agent over a recording without losses, keeping what the last round exchanged."""
 
-    def __init__(self, recording: Recording, settings: EstimatorSettings) -> None:
+    def __init__(self, recording: StudyInput, settings: EstimatorSettings) -> None:
         self.recording = recording
         self.adjacent = neighbours(recording)
         layout = Layout(tuple(int(agent) for agent in recording.agents))

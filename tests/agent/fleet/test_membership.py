@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from agent.config.tables import FleetConfig
-from agent.fleet.membership import Roll, is_absent
-from agent.fleet.record_store import RecordStore
+from agent.fleet.measurement_store import MeasurementStore
+from agent.fleet.membership import Membership, is_absent
 from agent.fleet.tracking import ABSENT_VARIANCE, FleetTracker, in_layout
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
@@ -19,41 +19,46 @@ from estimators.integrity.finding import What, has
 from estimators.integrity.range_geometry import GeometryMonitor
 from estimators.model.layout import Layout
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import AccelerationRecord, PositionRecord, RangeRecord, Record
+from transport.messages.measurement_body import (
+    AccelerationMeasurement,
+    Measurement,
+    PositionMeasurement,
+    RangeMeasurement,
+)
 
 MakeConfig = Callable[..., FleetConfig]
 AWAY = np.array([[0.0, 0.0, -5.0], [9.0, 0.0, -6.0], [0.0, 8.0, -4.0], [7.0, 7.0, -12.0], [-6.0, 2.0, -9.0]])
 """Where drones 1 to 5 hover."""
 
 
-def fix(agent: int, tick: int) -> PositionRecord:
+def fix(agent: int, tick: int) -> PositionMeasurement:
     north, east, down = AWAY[agent - 1]
-    return PositionRecord(agent, tick, (north, east, down), (0.01, 0.01, 0.01))
+    return PositionMeasurement(agent, tick, (north, east, down), (0.01, 0.01, 0.01))
 
 
-def still(agent: int, tick: int) -> AccelerationRecord:
-    return AccelerationRecord(agent, tick, (0.0, 0.0, 0.0), (0.003, 0.003, 0.003))
+def still(agent: int, tick: int) -> AccelerationMeasurement:
+    return AccelerationMeasurement(agent, tick, (0.0, 0.0, 0.0), (0.003, 0.003, 0.003))
 
 
-def ranged(observer: int, other: int, tick: int) -> RangeRecord:
+def ranged(observer: int, other: int, tick: int) -> RangeMeasurement:
     distance = float(np.linalg.norm(AWAY[observer - 1] - AWAY[other - 1]))
-    return RangeRecord(observer, tick, other, distance, 0.003)
+    return RangeMeasurement(observer, tick, other, distance, 0.003)
 
 
 class Agent:
     """Drone 1's tracker, fed with records by tick, without neighbours' pairs."""
 
     def __init__(self, config: FleetConfig) -> None:
-        self.store = RecordStore(config, 1)
+        self.store = MeasurementStore(config, 1)
         self.counters: Counter[str] = Counter()
         self.tracker = FleetTracker(config, 1, make_estimator, self.counters)
         self.config = config
         self.tick = 0
 
-    def feed(self, record: Record) -> None:
+    def feed(self, record: Measurement) -> None:
         self.store.neighbourhood.hear(record.observer, self.tick)
         if record.observer == 1:
-            taken: Record | None = self.store.add_own(record)
+            taken: Measurement | None = self.store.add_own(record)
         else:
             taken = record if self.store.add_heard(record.observer, [record], self.tick) else None
         if taken is not None:
@@ -147,7 +152,7 @@ def pair(agents: tuple[int, ...], sigma_m: float, tick: int = 5) -> Information:
 
 
 def test_a_pair_tells_of_drones_out_of_reach_if_it_knows_them_well(make_config: MakeConfig) -> None:
-    roll = Roll(make_config(3), 1)
+    roll = Membership(make_config(3), 1)
     roll.note_pair(pair((2, 3), 4.0))
     assert roll.newcomers(6, 6) == {}
     roll.note_pair(pair((2, 3), 0.5))
@@ -162,7 +167,7 @@ def test_a_pair_tells_of_drones_out_of_reach_if_it_knows_them_well(make_config: 
 
 
 def test_who_is_known_from_pairs_alone_goes_when_they_keep_it_no_surer_than_silence(make_config: MakeConfig) -> None:
-    roll = Roll(make_config(3), 1)
+    roll = Membership(make_config(3), 1)
     roll.enter((1, 3), (), 0)
     for sigma_m, gone in ((0.5, ()), (6.0, (3,))):
         covariance = np.diag(np.repeat([0.01, sigma_m**2], 6))

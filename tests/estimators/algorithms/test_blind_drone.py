@@ -20,8 +20,8 @@ from estimators.factory import make_estimator
 from estimators.model.layout import position
 from estimators.settings import EstimatorSettings
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 
 Array = NDArray[np.float64]
 SHARED = EstimatorSettings(
@@ -29,9 +29,9 @@ SHARED = EstimatorSettings(
 )
 
 
-def blind_flight(graph: str, run: int, samples: int, start_sigma_m: float = 2.0) -> Recording:
+def blind_flight(graph: str, run: int, samples: int, start_sigma_m: float = 2.0) -> StudyInput:
     """The last agent is blind; everybody starts with errors of ``start_sigma_m`` per axis and 1 m/s."""
-    recording = Scenario(graph=graph, samples=samples, blind=1).record(0, run)
+    recording = StudyScenario(graph=graph, samples=samples, blind=1).record(0, run)
     assert recording.truth is not None
     agents = len(recording.agents)
     sigmas = np.tile([start_sigma_m] * 3 + [1.0] * 3, agents)
@@ -39,7 +39,7 @@ def blind_flight(graph: str, run: int, samples: int, start_sigma_m: float = 2.0)
     return replace(recording, x0=recording.truth[0].ravel() + errors)
 
 
-def judged(recording: Recording, result: LockstepResult) -> tuple[Array, Array, NDArray[np.bool_]]:
+def judged(recording: StudyInput, result: LockstepResult) -> tuple[Array, Array, NDArray[np.bool_]]:
     """Error and sigma of the blind drone's own position, and where its status is not observable, by tick."""
     assert recording.truth is not None
     blind = len(recording.agents) - 1
@@ -88,7 +88,7 @@ def test_a_start_at_the_mirror_image_is_not_taken_for_the_truth() -> None:
     assert not flagged[-10:].any()
 
 
-def renamed(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
+def renamed(recording: StudyInput) -> tuple[StudyInput, Callable[[Array], Array]]:
     order = np.array([1, 0, 2])
     states = (6 * order[:, None] + np.arange(6)).ravel()
     assert recording.truth is not None
@@ -103,7 +103,7 @@ def renamed(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
     ), lambda mean: mean[:, order][:, :, states]
 
 
-def moved(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
+def moved(recording: StudyInput) -> tuple[StudyInput, Callable[[Array], Array]]:
     shift = np.array([300.0, -200.0, 50.0])
     whole = np.tile(np.r_[shift, 0.0, 0.0, 0.0], 3)
     assert recording.truth is not None
@@ -113,7 +113,7 @@ def moved(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
     return replace(recording, gps=gps, truth=truth, x0=recording.x0 + whole), lambda mean: mean + whole
 
 
-def turned(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
+def turned(recording: StudyInput) -> tuple[StudyInput, Callable[[Array], Array]]:
     c, s = np.cos(0.7), np.sin(0.7)
     turn = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     fleet = np.kron(np.eye(6), turn)
@@ -127,7 +127,7 @@ def turned(recording: Recording) -> tuple[Recording, Callable[[Array], Array]]:
 
 @pytest.mark.parametrize("change", [renamed, moved, turned])
 def test_names_place_and_north_do_not_matter(
-    change: Callable[[Recording], tuple[Recording, Callable[[Array], Array]]],
+    change: Callable[[StudyInput], tuple[StudyInput, Callable[[Array], Array]]],
 ) -> None:
     recording = blind_flight("triangle", 2, 25)
     other, back = change(recording)
@@ -140,7 +140,7 @@ def test_names_place_and_north_do_not_matter(
 
 def _silent_start(monkeypatch: pytest.MonkeyPatch, run: int) -> LockstepResult:
     """A line of three whose agents hear nothing for two seconds and take the others to be 10 m beside themselves."""
-    recording = Scenario(graph="line", samples=60).record(0, run)
+    recording = StudyScenario(graph="line", samples=60).record(0, run)
     assert recording.truth is not None
     angles = 2 * np.pi * np.arange(3) / 3
     beside = 10.0 * np.stack([np.cos(angles), np.sin(angles), np.zeros(3)], axis=-1)

@@ -20,7 +20,7 @@ from estimators.settings import Kind as EstimatorKind
 from estimators.window.solving import solve_window
 from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import run_lockstep
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import builders
 from tests.support import dense_reference as dense
 
@@ -41,7 +41,7 @@ def settings_of(kind: EstimatorKind, window: int) -> EstimatorSettings:
 @pytest.mark.parametrize("graph", ["triangle", "K4"])
 def test_exact_from_an_exact_start(graph: str, kind: EstimatorKind, window: int) -> None:
     # GIVEN a flight measured without noise, all inputs known to all, estimates that start at the truth
-    recording = builders.noiseless(Scenario(graph=graph, samples=25).record(2, 0))
+    recording = builders.noiseless(StudyScenario(graph=graph, samples=25).record(2, 0))
     assert recording.truth is not None
     # WHEN the fleet runs
     result = run_lockstep(recording, settings_of(kind, window))
@@ -55,7 +55,7 @@ def test_exact_from_an_exact_start(graph: str, kind: EstimatorKind, window: int)
 def test_a_wrong_start_is_forgotten(kind: EstimatorKind) -> None:
     # GIVEN the same without noise, every agent with a wrong start of its own, and an assumed input noise
     # (5 m/s2) that makes the past fade
-    recording = builders.noiseless(Scenario(graph="triangle", samples=140).record(4, 0))
+    recording = builders.noiseless(StudyScenario(graph="triangle", samples=140).record(4, 0))
     wrong = recording.x0 + np.random.default_rng(1).uniform(-0.5, 0.5, recording.x0.shape)
     recording = replace(recording, x0=wrong, accel_half_width=5.0)
     # WHEN the fleet runs, THEN the estimates come to the truth and stay there

@@ -22,7 +22,7 @@ from estimators.window.history import MeasurementWindow
 from estimators.window.solving import pre_estimation, solve_window
 from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import Links, own_input, own_rows, run_lockstep
-from sim_bridge.studies.recording import Recording, recording_from_arrays
+from sim_bridge.studies.study_input import StudyInput, recording_from_arrays
 from tests.support import dense_reference as dense
 from tests.support import frozen_cases
 
@@ -55,7 +55,7 @@ def every_case() -> list[Any]:
 class Case:
     arrays: dict[str, Any]
     options: dict[str, Any]
-    recording: Recording
+    recording: StudyInput
     settings: EstimatorSettings
 
     @classmethod

@@ -20,8 +20,8 @@ from estimators.settings import Kind as EstimatorKind
 from estimators.window.solving import solve_window
 from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import builders
 
 Array = NDArray[np.float64]
@@ -29,15 +29,15 @@ ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", 
 ROUNDING_M = 1e-6
 
 
-def run(recording: Recording, kind: EstimatorKind) -> LockstepResult:
+def run(recording: StudyInput, kind: EstimatorKind) -> LockstepResult:
     settings = EstimatorSettings(kind=kind, window=3, rounds=2, tolerance=1e-10, max_iterations=500)
     return run_lockstep(recording, settings)
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording() -> StudyInput:
     """A flight of four on a ring with some packets lost, so that the agents' situations differ."""
-    made = Scenario(graph="ring4", samples=25).record(11, 1)
+    made = StudyScenario(graph="ring4", samples=25).record(11, 1)
     received = np.random.default_rng(1).random(made.received.shape) < 0.8
     gps = made.gps.copy()
     gps[5:9, 2] = np.nan
@@ -57,7 +57,7 @@ def about_the_vertical(angle: float) -> Array:
 @pytest.mark.parametrize(
     "kind", ESTIMATORS
 )
-def test_renaming_the_agents(recording: Recording, kind: EstimatorKind) -> None:
+def test_renaming_the_agents(recording: StudyInput, kind: EstimatorKind) -> None:
     # GIVEN the same flight with the agents in another order
     order = np.array([2, 0, 3, 1])  # place k of the new recording is agent order[k] of the old
     states = (6 * order[:, None] + np.arange(6)).ravel()
@@ -85,7 +85,7 @@ def test_renaming_the_agents(recording: Recording, kind: EstimatorKind) -> None:
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)
-def test_moving_the_origin_by_a_kilometre(recording: Recording, kind: EstimatorKind) -> None:
+def test_moving_the_origin_by_a_kilometre(recording: StudyInput, kind: EstimatorKind) -> None:
     shift = np.array([1000.0, -700.0, 150.0])
     whole = np.tile(np.concatenate([shift, np.zeros(3)]), 4)
     assert recording.truth is not None
@@ -100,7 +100,7 @@ def test_moving_the_origin_by_a_kilometre(recording: Recording, kind: EstimatorK
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)
-def test_turning_north(recording: Recording, kind: EstimatorKind) -> None:
+def test_turning_north(recording: StudyInput, kind: EstimatorKind) -> None:
     # GIVEN the same flight seen in a frame turned about the vertical; the noises are equal in both horizontal axes
     turn = about_the_vertical(0.7)
     fleet = fleet_matrix(turn, 4)

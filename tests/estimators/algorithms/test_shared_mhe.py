@@ -13,7 +13,7 @@ from estimators.model.measurements import empty_inputs, empty_rows, input_rows, 
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
 from sim_bridge.studies.lockstep import run_lockstep
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_scenario import StudyScenario
 
 SHARED = EstimatorSettings(
     kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
@@ -109,7 +109,7 @@ def test_a_pair_of_another_window_start_is_not_used() -> None:
 
 @pytest.mark.slow
 def test_it_is_consistent_and_near_the_centralised_filter_on_the_papers_fleet() -> None:
-    runs = [Scenario().record(1, run) for run in range(4)]
+    runs = [StudyScenario().record(1, run) for run in range(4)]
     central = EstimatorSettings(kind="centralized_ekf", iterations_ekf=20)
 
     def steady(settings: EstimatorSettings) -> tuple[float, float]:

@@ -15,8 +15,8 @@ from estimators.model.cramer_rao import (
 from estimators.model.layout import position, velocity
 from estimators.model.measurements import empty_rows, position_rows
 from sim_bridge.studies.lockstep import own_rows
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import builders
 from tests.support.dense_reference import Kalman
 
@@ -65,7 +65,7 @@ def test_rows_add_what_they_know() -> None:
     np.testing.assert_allclose(row_information(rows, np.zeros(12), EPS), expected, atol=1e-12)
 
 
-def flight(recording: Recording) -> Flight:
+def flight(recording: StudyInput) -> Flight:
     """Rows and true states of a recording, everybody's."""
     assert recording.truth is not None
     ticks, n, _ = recording.truth.shape
@@ -74,7 +74,7 @@ def flight(recording: Recording) -> Flight:
 
 
 def test_the_average_is_over_flights() -> None:
-    recordings = [Scenario(samples=3).record(1, run) for run in range(2)]
+    recordings = [StudyScenario(samples=3).record(1, run) for run in range(2)]
     single = [mean_row_information([flight(each)], EPS) for each in recordings]
     both = mean_row_information([flight(each) for each in recordings], EPS)
     np.testing.assert_allclose(both, 0.5 * (single[0] + single[1]), rtol=1e-14)
@@ -82,7 +82,7 @@ def test_the_average_is_over_flights() -> None:
 
 def test_steady_bound_of_the_line_of_three() -> None:
     # GIVEN twenty flights of the studies' line of three, good start, all inputs known
-    recordings = [Scenario(graph="line").record(0, run) for run in range(20)]
+    recordings = [StudyScenario(graph="line").record(0, run) for run in range(20)]
     measured = mean_row_information([flight(each) for each in recordings], EPS)
     variance = np.full((70, 9), 0.1**2 / 3)
     # WHEN the bound is computed

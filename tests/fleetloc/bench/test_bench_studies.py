@@ -21,7 +21,7 @@ from fleetloc.errors import InputError
 from sim_bridge.studies.air import Air, lossy
 from sim_bridge.studies.genie import Genie
 from sim_bridge.studies.monte_carlo import Sample
-from sim_bridge.studies.study_scenario import GRAPHS, Scenario
+from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario
 
 # --- methods and conditions -------------------------------------------------------------------------------------
 
@@ -57,7 +57,7 @@ def test_conditions_of_the_link_study() -> None:
 
 
 def test_conditions_of_the_accuracy_study() -> None:
-    found = sweep_points(Scenario("K5"), "ring", [3, 7], [1.0, 0.6], [0.0, 10.0])
+    found = sweep_points(StudyScenario("K5"), "ring", [3, 7], [1.0, 0.6], [0.0, 10.0])
     assert [each.scenario.graph for each in found] == ["triangle", "ring7", "K5", "K5", "K5", "K5"]
     assert [each.scenario.blind for each in found] == [0, 0, 0, 2, 0, 0]
     assert [each.scenario.start_offset_m for each in found] == [0, 0, 0, 0, 0, 10.0]
@@ -131,12 +131,12 @@ def test_when_islands_agree_again_by_hand() -> None:
 
 def test_figures_of_a_partition_by_hand() -> None:
     # GIVEN one run of 30 ticks cut over ticks 10..19, whose islands agree again 3 ticks after
-    plan = parts.Plan(EstimatorSettings(), 0, begin_s=10, length_s=10, after_s=9, period_s=1.0)
+    plan = parts.PartitionPlan(EstimatorSettings(), 0, begin_s=10, length_s=10, after_s=9, period_s=1.0)
     assert plan.cut == (10, 20)
     island, rest, apart = np.ones(30), np.full(30, 0.5), np.ones(30)
     island[15], rest[22] = 3.0, 7.0
     apart[10:23] = 8.0
-    outcome = parts.Outcome((island, rest), 2 * apart, 2 * np.ones(30), 4 * apart, np.ones(30), 0.75)
+    outcome = parts.PartitionOutcome((island, rest), 2 * apart, 2 * np.ones(30), 4 * apart, np.ones(30), 0.75)
     found = parts.figures(plan, [outcome, outcome])
     assert found["availability"] == 0.75
     assert found["anees_island_largest_of_a_tick"] == 3.0
@@ -223,7 +223,7 @@ def test_accuracy_command(tmp_path: Path, capsys: pytest.CaptureFixture[str]) ->
 def test_partition_and_blind_commands(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(parts, "Plan", partial(parts.Plan, begin_s=1.0, after_s=5.5))
+    monkeypatch.setattr(parts, "PartitionPlan", partial(parts.PartitionPlan, begin_s=1.0, after_s=5.5))
     partition = ["partition", "--runs", "1", "--length", "1", "--jobs", "1", "--out", str(tmp_path)]
     assert cli.main(["bench", *partition]) == 0
     document = json.loads((tmp_path / "results.json").read_text())

@@ -12,7 +12,7 @@ import pytest
 
 from fleetloc import cli
 from fleetloc.errors import BAD_INPUT
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import frozen_cases
 from tests.support.builders import recording_arrays
 
@@ -24,7 +24,7 @@ SHARED = Path(__file__).resolve().parents[3].parent / "shared" / "cases" / "dmhe
 def recording(tmp_path: Path) -> Path:
     """A short flight."""
     path = tmp_path / "flight.npz"
-    Scenario(samples=5).record(1, 0).save(path)
+    StudyScenario(samples=5).record(1, 0).save(path)
     return path
 
 
@@ -74,7 +74,7 @@ def test_figures(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     assert written["ticks"] == 6
     assert written["late_records_dropped"] == 0
     assert [agent["id"] for agent in written["agents"]] == [1, 2, 3]
-    truth = Scenario(samples=5).record(1, 0).truth
+    truth = StudyScenario(samples=5).record(1, 0).truth
     assert truth is not None
     with np.load(out) as estimates:
         error = estimates["mean"] - truth.reshape(6, 1, 18)

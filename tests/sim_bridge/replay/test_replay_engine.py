@@ -35,7 +35,7 @@ from sim_bridge.replay.range_files import RangeLine
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
 from sim_bridge.replay.what_if import GpsDrop, GpsDrops
 from tests.support.holding import held
-from transport.messages.measurement_body import RangeRecord
+from transport.messages.measurement_body import RangeMeasurement
 
 ROOMS = {"agent", "estimators", "sim_bridge", "transport"}
 FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
@@ -313,6 +313,6 @@ def test_a_longer_log_leaves_no_more_behind() -> None:
         held(Forgetful(logs=tuple(FlightLog(i, seconds=seconds) for i in CENTRES)).replay) for seconds in (8.0, 20.0)
     )
     ours = [kind for kind in short if kind.__module__.split(".")[0] in ROOMS]
-    assert {ImuSample, TruthSample, RangeRecord} <= set(ours)
+    assert {ImuSample, TruthSample, RangeMeasurement} <= set(ours)
     assert {kind: long[kind] for kind in ours} == {kind: short[kind] for kind in ours}
     assert long.total() < 1.2 * short.total()  # 12 s more of measurements alone are 900 objects of a drone

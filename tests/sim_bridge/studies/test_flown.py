@@ -12,18 +12,18 @@ from estimators.settings import EstimatorSettings, default_settings
 from sim_bridge.studies.air import Air, lossy
 from sim_bridge.studies.flown import FlownResult, config_of, fly_recording
 from sim_bridge.studies.lockstep import run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from transport.link.channel import LinkFaults
 
 SETTINGS = default_settings()
 
 
-def line(samples: int = 25, run: int = 0) -> Recording:
-    return Scenario(samples=samples).record(4, run)
+def line(samples: int = 25, run: int = 0) -> StudyInput:
+    return StudyScenario(samples=samples).record(4, run)
 
 
-def errors(recording: Recording, mean: np.ndarray) -> np.ndarray:
+def errors(recording: StudyInput, mean: np.ndarray) -> np.ndarray:
     assert recording.truth is not None
     return np.linalg.norm(mean - recording.truth.reshape(len(recording.truth), 1, -1), axis=-1)
 
@@ -83,7 +83,7 @@ def test_bytes_are_counted_by_kind_and_within_what_packets_may_hold(flown: Flown
 
 
 def test_a_drone_without_fixes_flies_on_its_ranges() -> None:
-    recording = Scenario("K4", 60, blind=1, start_sigma_m=2.0).record(0, 0)
+    recording = StudyScenario("K4", 60, blind=1, start_sigma_m=2.0).record(0, 0)
     found = fly_recording(recording, SETTINGS).estimates
     assert recording.truth is not None
     error = np.linalg.norm(found.mean[40:, 3, 18:21] - recording.truth[40:, 3, :3], axis=-1)

@@ -13,8 +13,8 @@ from sim_bridge.studies.air import lossy
 from sim_bridge.studies.flown import fly_recording
 from sim_bridge.studies.genie import Genie
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support.link_conditions import with_loss
 from tests.support.whole_exchange import heard_of
 
@@ -28,16 +28,16 @@ def relay(window: int) -> EstimatorSettings:
 RELAY = relay(12)
 
 
-def line(samples: int = 12) -> Recording:
-    return Scenario(samples=samples).record(4, 0)
+def line(samples: int = 12) -> StudyInput:
+    return StudyScenario(samples=samples).record(4, 0)
 
 
-def genie(recording: Recording) -> LockstepResult:
+def genie(recording: StudyInput) -> LockstepResult:
     """Of a fleet whose packets of records come twice a tick and carry everything."""
     return Genie(RELAY).run(recording, heard_of(recording, 2))
 
 
-def only_positions(recording: Recording) -> Recording:
+def only_positions(recording: StudyInput) -> StudyInput:
     """The linear problem: no speed and no range rows."""
     gps = recording.gps.copy()
     gps[:, :, 3] = np.nan
@@ -83,7 +83,7 @@ def test_no_worse_than_the_flown_estimator_it_bounds() -> None:
     # GIVEN the same runs over bad links, flown
     settings, figures = default_settings(), []
     for run in range(4):
-        recording = Scenario(samples=60).record(9, run)
+        recording = StudyScenario(samples=60).record(9, run)
         assert recording.truth is not None
         truth = recording.truth.reshape(61, 1, 18)
         flown = fly_recording(recording, settings, lossy(0.6), seed=run)

@@ -12,18 +12,18 @@ from estimators.model.measurements import Kind
 from estimators.settings import EstimatorSettings
 from estimators.settings import Kind as EstimatorKind
 from sim_bridge.studies.lockstep import Links, neighbours, own_input, own_rows, run_lockstep
-from sim_bridge.studies.recording import Recording
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import StudyInput
+from sim_bridge.studies.study_scenario import StudyScenario
 
 ESTIMATORS: tuple[EstimatorKind, ...] = ("dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf")
 
 
 @pytest.fixture
-def recording() -> Recording:
-    return Scenario(samples=12).record(5, 0)
+def recording() -> StudyInput:
+    return StudyScenario(samples=12).record(5, 0)
 
 
-def test_rows_of_an_agent(recording: Recording) -> None:
+def test_rows_of_an_agent(recording: StudyInput) -> None:
     rows = own_rows(recording, 4, 1)
     assert rows["kind"].tolist() == [Kind.POSITION] * 3 + [Kind.SPEED] + [Kind.RANGE] * 2
     np.testing.assert_array_equal(rows["value"][:4], recording.gps[4, 1])
@@ -38,7 +38,7 @@ def test_rows_of_an_agent(recording: Recording) -> None:
     np.testing.assert_allclose(rows["variance"], np.square(half) / 3)
 
 
-def test_what_was_not_measured_is_no_row(recording: Recording) -> None:
+def test_what_was_not_measured_is_no_row(recording: StudyInput) -> None:
     gps, ranges = recording.gps.copy(), recording.ranges.copy()
     gps[4, 1, :3] = np.nan
     ranges[4, 1, 0] = np.nan
@@ -49,7 +49,7 @@ def test_what_was_not_measured_is_no_row(recording: Recording) -> None:
     assert len(own_rows(replace(recording, gps=gps, ranges=ranges), 4, 1)) == 0
 
 
-def test_input_belongs_to_the_tick_before(recording: Recording) -> None:
+def test_input_belongs_to_the_tick_before(recording: StudyInput) -> None:
     assert len(own_input(recording, 0, 2)) == 0
     found = own_input(recording, 3, 2)
     assert found["tick"].tolist() == [2]
@@ -57,7 +57,7 @@ def test_input_belongs_to_the_tick_before(recording: Recording) -> None:
     np.testing.assert_allclose(found["variance"][0], 0.1**2 / 3)
 
 
-def test_links(recording: Recording) -> None:
+def test_links(recording: StudyInput) -> None:
     # GIVEN a line of three, one packet lost and one late
     received, delay = recording.received.copy(), recording.delay_ticks.copy()
     received[3, 0, 1] = False
@@ -73,7 +73,7 @@ def test_links(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)
-def test_run_repeats_bit_by_bit(recording: Recording, kind: EstimatorKind) -> None:
+def test_run_repeats_bit_by_bit(recording: StudyInput, kind: EstimatorKind) -> None:
     settings = EstimatorSettings(kind=kind)
     first, second = (run_lockstep(recording, settings) for _ in range(2))
     np.testing.assert_array_equal(first.mean, second.mean)
@@ -82,7 +82,7 @@ def test_run_repeats_bit_by_bit(recording: Recording, kind: EstimatorKind) -> No
 
 
 @pytest.mark.parametrize("kind", ESTIMATORS)
-def test_shape_and_health_of_a_run(recording: Recording, kind: EstimatorKind) -> None:
+def test_shape_and_health_of_a_run(recording: StudyInput, kind: EstimatorKind) -> None:
     ticks = []
     result = run_lockstep(recording, EstimatorSettings(kind=kind), ticks.append)
     assert ticks == list(range(13))
@@ -100,13 +100,13 @@ def test_shape_and_health_of_a_run(recording: Recording, kind: EstimatorKind) ->
         assert np.abs(result.mean[:, 0] - result.mean[:, 2]).max() > 1e-6
 
 
-def test_without_truth_there_is_no_nees(recording: Recording) -> None:
+def test_without_truth_there_is_no_nees(recording: StudyInput) -> None:
     result = run_lockstep(replace(recording, truth=None), EstimatorSettings(kind="dekf_ci"))
     assert result.nees_full is None
     assert result.nees_own is None
 
 
-def test_centralised_starts_from_row_zero(recording: Recording) -> None:
+def test_centralised_starts_from_row_zero(recording: StudyInput) -> None:
     settings = EstimatorSettings(kind="centralized_ekf")
     x0 = recording.x0.copy()
     x0[1:] = 77.0
@@ -115,7 +115,7 @@ def test_centralised_starts_from_row_zero(recording: Recording) -> None:
 
 
 @pytest.mark.parametrize("kind", ["dmhe_pre_ekf", "dekf_ci"])
-def test_nobody_heard_is_everybody_alone(recording: Recording, kind: EstimatorKind) -> None:
+def test_nobody_heard_is_everybody_alone(recording: StudyInput, kind: EstimatorKind) -> None:
     # GIVEN a fleet of which no packet arrives, and the same without edges (the ranges are measured all the same)
     settings = EstimatorSettings(kind=kind)
     deaf = replace(recording, received=np.zeros_like(recording.received))
@@ -124,7 +124,7 @@ def test_nobody_heard_is_everybody_alone(recording: Recording, kind: EstimatorKi
 
 
 @pytest.mark.parametrize("kind", ["dmhe_pre_ekf", "dmhe"])
-def test_late_packets_within_the_window_are_used(recording: Recording, kind: EstimatorKind) -> None:
+def test_late_packets_within_the_window_are_used(recording: StudyInput, kind: EstimatorKind) -> None:
     # GIVEN neighbours' packets that all come a tick late, or not at all
     late = replace(recording, delay_ticks=np.ones_like(recording.delay_ticks))
     lost = replace(recording, received=np.zeros_like(recording.received))
@@ -132,14 +132,14 @@ def test_late_packets_within_the_window_are_used(recording: Recording, kind: Est
     assert recording.truth is not None
     truth = recording.truth.reshape(13, 1, 18)
 
-    def error(which: Recording) -> float:
+    def error(which: StudyInput) -> float:
         return float(np.linalg.norm(run_lockstep(which, settings).mean - truth, axis=-1)[6:].mean())
 
     # THEN the late rows help
     assert error(late) < 0.7 * error(lost)
 
 
-def test_packets_later_than_the_window_are_counted(recording: Recording) -> None:
+def test_packets_later_than_the_window_are_counted(recording: StudyInput) -> None:
     # GIVEN delays beyond N = 2 on every link of the line: each packet holds 4 GPS rows and the sender's ranges
     late = replace(recording, delay_ticks=np.full_like(recording.delay_ticks, 4))
     result = run_lockstep(late, EstimatorSettings(window=2))
@@ -149,7 +149,7 @@ def test_packets_later_than_the_window_are_counted(recording: Recording) -> None
 
 def test_sharing_inputs_helps() -> None:
     # GIVEN a flight beyond its transient
-    recording = Scenario(samples=45).record(5, 0)
+    recording = StudyScenario(samples=45).record(5, 0)
     assert recording.truth is not None
     truth = recording.truth.reshape(46, 1, 18)
 

@@ -12,9 +12,9 @@ from estimators.settings import EstimatorSettings, default_settings
 from sim_bridge.studies.air import lossy
 from sim_bridge.studies.lockstep import LockstepResult
 from sim_bridge.studies.monte_carlo import (
-    Flight,
     Hangar,
     Sample,
+    StudyFlight,
     accuracy_row,
     mean_and_error,
     ratio_of_means,
@@ -23,8 +23,8 @@ from sim_bridge.studies.monte_carlo import (
     window_mean,
     window_rms,
 )
-from sim_bridge.studies.recording import recording_from_arrays
-from sim_bridge.studies.study_scenario import GRAPHS, Scenario, graph_of
+from sim_bridge.studies.study_input import recording_from_arrays
+from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario, graph_of
 from tests.support.builders import recording_arrays
 
 # --- scenario ---------------------------------------------------------------------------------------------------
@@ -32,7 +32,7 @@ from tests.support.builders import recording_arrays
 
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_every_graph_makes_a_valid_recording(graph: str) -> None:
-    made = Scenario(graph=graph, samples=5).record(0, 0)
+    made = StudyScenario(graph=graph, samples=5).record(0, 0)
     recording_from_arrays(recording_arrays(made), graph)
     agents, edges = GRAPHS[graph]
     assert len(made.agents) == agents
@@ -46,7 +46,7 @@ def test_every_graph_makes_a_valid_recording(graph: str) -> None:
 
 def test_noises_are_within_their_bounds_and_fill_them() -> None:
     # GIVEN some flights
-    recordings = [Scenario(samples=60).record(1, run) for run in range(3)]
+    recordings = [StudyScenario(samples=60).record(1, run) for run in range(3)]
     for made in recordings:
         assert made.truth is not None
         positions, velocities = made.truth[..., :3], made.truth[..., 3:]
@@ -69,7 +69,7 @@ def test_noises_are_within_their_bounds_and_fill_them() -> None:
 
 
 def test_plant_moves_by_the_double_integrator() -> None:
-    made = Scenario(samples=20, period_s=0.2).record(4, 0)
+    made = StudyScenario(samples=20, period_s=0.2).record(4, 0)
     assert made.truth is not None
     p, v = made.truth[..., :3], made.truth[..., 3:]
     applied = np.diff(v, axis=0) / 0.2
@@ -77,28 +77,28 @@ def test_plant_moves_by_the_double_integrator() -> None:
 
 
 def test_flight_ends_at_the_references() -> None:
-    made = Scenario(samples=200).record(4, 0)
+    made = StudyScenario(samples=200).record(4, 0)
     assert made.truth is not None
     np.testing.assert_allclose(made.truth[-1, :, :3], [[5, 0, 5], [0, 5, 6], [-5, 0, 7]], atol=0.1)
     np.testing.assert_allclose(made.truth[-1, :, 3:], 0.0, atol=0.1)
 
 
 def test_run_is_a_function_of_seed_and_run() -> None:
-    first, again = (Scenario(samples=8).record(7, 3) for _ in range(2))
+    first, again = (StudyScenario(samples=8).record(7, 3) for _ in range(2))
     for key, value in recording_arrays(first).items():
         np.testing.assert_array_equal(recording_arrays(again)[key], value, err_msg=key)
-    for other in (Scenario(samples=8).record(7, 4), Scenario(samples=8).record(8, 3)):
+    for other in (StudyScenario(samples=8).record(7, 4), StudyScenario(samples=8).record(8, 3)):
         assert np.abs(other.gps - first.gps).max() > 0.1
 
 
 def test_starts() -> None:
-    paper = Scenario(samples=3, start="paper").record(0, 0)
+    paper = StudyScenario(samples=3, start="paper").record(0, 0)
     assert not paper.x0.any()
     np.testing.assert_array_equal(np.diag(paper.P0), np.tile([6.0, 6.0, 6.0, 0.01, 0.01, 0.01], 3))
     # the good start is drawn from its own covariance, by every agent for itself
     errors = []
     for run in range(60):
-        good = Scenario(samples=1).record(0, run)
+        good = StudyScenario(samples=1).record(0, run)
         assert good.truth is not None
         errors.append(good.x0 - good.truth[0].ravel())
     variance = np.var(np.concatenate(errors), axis=0).reshape(3, 2, 3).mean(axis=(0, 2))
@@ -107,14 +107,14 @@ def test_starts() -> None:
 
 
 def test_blind_agents_are_the_last() -> None:
-    made = Scenario(graph="K5", samples=3, blind=2).record(0, 0)
+    made = StudyScenario(graph="K5", samples=3, blind=2).record(0, 0)
     assert np.isnan(made.gps[:, 3:]).all()
     assert np.isfinite(made.gps[:, :3]).all()
 
 
 def test_unknown_graph() -> None:
     with pytest.raises(ValueError, match=r"graph: expected one of line, .*, found 'moebius'"):
-        Scenario(graph="moebius")
+        StudyScenario(graph="moebius")
 
 
 def test_families_of_graphs() -> None:
@@ -131,7 +131,7 @@ def test_an_offset_start_is_off_and_its_covariance_says_so() -> None:
     # GIVEN starts with hardly any spread but 10 m off
     squares = []
     for run in range(40):
-        made = Scenario(samples=1, start_sigma_m=1e-6, start_offset_m=10.0).record(3, run)
+        made = StudyScenario(samples=1, start_sigma_m=1e-6, start_offset_m=10.0).record(3, run)
         assert made.truth is not None
         error = (made.x0 - made.truth[0].ravel()).reshape(3, 3, 6)
         # THEN every position of every agent is, each its own way, and no velocity more than before
@@ -142,13 +142,13 @@ def test_an_offset_start_is_off_and_its_covariance_says_so() -> None:
     np.testing.assert_allclose(mean[:3], 100.0 / 3.0, rtol=0.15)
     np.testing.assert_allclose(mean[3:], 1.0, rtol=0.2)
     with pytest.raises(ValueError, match="expected the good start"):
-        Scenario(start="paper", start_offset_m=1.0)
+        StudyScenario(start="paper", start_offset_m=1.0)
 
 
 def test_a_start_of_another_spread() -> None:
     errors = []
     for run in range(40):
-        made = Scenario(samples=1, start_sigma_m=0.3).record(0, run)
+        made = StudyScenario(samples=1, start_sigma_m=0.3).record(0, run)
         assert made.truth is not None
         errors.append((made.x0 - made.truth[0].ravel()).reshape(-1, 6))
     assert np.std(np.concatenate(errors)[:, :3]) == pytest.approx(0.3, rel=0.1)
@@ -156,9 +156,9 @@ def test_a_start_of_another_spread() -> None:
 
 
 def test_vehicles_that_move_on_fly_to_the_next_ones_reference() -> None:
-    made = Scenario(graph="triangle", samples=240, turn_every_s=12.0).record(0, 0)
+    made = StudyScenario(graph="triangle", samples=240, turn_every_s=12.0).record(0, 0)
     assert made.truth is not None
-    first = Scenario(graph="triangle", samples=120).record(0, 0).truth
+    first = StudyScenario(graph="triangle", samples=120).record(0, 0).truth
     assert first is not None
     np.testing.assert_array_equal(made.truth[:121], first)
     np.testing.assert_allclose(made.truth[-1, :, :3], [[0, 5, 6], [-5, 0, 7], [5, 0, 5]], atol=0.15)
@@ -180,7 +180,7 @@ def a_result(error: np.ndarray, truth: np.ndarray) -> LockstepResult:
 
 def test_errors_of_a_run_by_hand() -> None:
     # GIVEN agent 0 wrong by (3, 4, 0) m in its own position and 2 m in that of agent 1; agent 1 by 1 m/s in its speed
-    arrays = recording_arrays(Scenario(graph="line", samples=1).record(0, 0))
+    arrays = recording_arrays(StudyScenario(graph="line", samples=1).record(0, 0))
     made = recording_from_arrays(arrays, "x")
     truth = np.zeros((2, 2, 6))
     recording = replace(made, agents=np.array([1, 2]), truth=truth)
@@ -225,9 +225,9 @@ def test_ratio_of_two_methods_on_the_same_runs_by_hand() -> None:
 
 def test_several_processes_give_what_one_gives() -> None:
     methods = {"central": EstimatorSettings(kind="centralized_ekf")}
-    alone = run_study(Scenario(samples=6), methods, 3, seed=2)
+    alone = run_study(StudyScenario(samples=6), methods, 3, seed=2)
     with Hangar(2) as hangar:
-        together = run_study(Scenario(samples=6), methods, 3, seed=2, hangar=hangar)
+        together = run_study(StudyScenario(samples=6), methods, 3, seed=2, hangar=hangar)
     for name in ("norm_full", "own_sigma", "nees_full", "status"):
         for one, other in zip(getattr(alone["central"], name), getattr(together["central"], name), strict=True):
             np.testing.assert_array_equal(one, other)
@@ -235,7 +235,7 @@ def test_several_processes_give_what_one_gives() -> None:
 
 def test_links_have_a_seed_of_their_own() -> None:
     def flown(seed: int, link_seed: int | None) -> np.ndarray:
-        flight = Flight(Scenario(samples=4), {"it": default_settings()}, seed, 0, lossy(0.5), link_seed)
+        flight = StudyFlight(StudyScenario(samples=4), {"it": default_settings()}, seed, 0, lossy(0.5), link_seed)
         return flight.fly()["it"].norm_full[0]
 
     np.testing.assert_array_equal(flown(1, None), flown(1, 1))
@@ -244,12 +244,12 @@ def test_links_have_a_seed_of_their_own() -> None:
 
 def test_a_study_is_flown_or_runs_tick_by_tick_and_says_what_was_served() -> None:
     methods = {"it": default_settings(), "central": EstimatorSettings(kind="centralized_ekf")}
-    flown = run_study(Scenario(samples=6), methods, 1, seed=2)
+    flown = run_study(StudyScenario(samples=6), methods, 1, seed=2)
     assert [len(flown[name].available) for name in methods] == [1, 0]  # a central filter does not fly
     row = accuracy_row(flown["it"], 1, 6)
     assert row["availability"] == 1.0
     assert row["sent_all_bytes_per_s"] > 0
-    stepped = run_study(Scenario(samples=6), methods, 1, seed=2, flown=False)
+    stepped = run_study(StudyScenario(samples=6), methods, 1, seed=2, flown=False)
     assert not stepped["it"].available
     np.testing.assert_array_equal(stepped["central"].norm_full[0], flown["central"].norm_full[0])
 
@@ -325,7 +325,7 @@ def test_small_study() -> None:
         "central": EstimatorSettings(kind="centralized_ekf", iterations_ekf=10),
     }
     calls = []
-    samples = run_study(Scenario(), methods, runs, seed=11, progress=lambda: calls.append(1), flown=False)
+    samples = run_study(StudyScenario(), methods, runs, seed=11, progress=lambda: calls.append(1), flown=False)
     assert len(calls) == runs * len(methods)
     rows = {name: accuracy_row(sample, 41, 70) for name, sample in samples.items()}
     # THEN the steady figures are those known from twenty other runs (.301, .185, .109), a run scattering by a fifth

@@ -26,7 +26,7 @@ from transport.messages.clock_body import (
     encode_clock_question,
 )
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements, RangeRecord
+from transport.messages.measurement_body import Measurements, RangeMeasurement
 from transport.messages.uwb_body import UwbFrame, UwbRange, decode_uwb, encode_uwb_json
 from transport.security.opening import Opener, Received
 from transport.security.sealing import Sealer
@@ -111,7 +111,7 @@ async def test_three_agents_exchange_measurements_and_consensus_rounds() -> None
         for node in nodes:
             assert node.agent_id is not None
             other = node.agent_id % 3 + 1
-            node.send(Measurements(5, (RangeRecord(node.agent_id, 5, other, 10.0, 0.25),)))
+            node.send(Measurements(5, (RangeMeasurement(node.agent_id, 5, other, 10.0, 0.25),)))
         for node in nodes:
             got = [await node.received() for _ in range(2)]
             assert {g.sender for g in got} == {1, 2, 3} - {node.agent_id}

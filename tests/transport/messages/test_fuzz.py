@@ -16,13 +16,13 @@ from transport.messages.estimate_body import FleetEstimate
 from transport.messages.header import HEADER, HEADER_BYTES, STREAM_OF_KIND, PacketKind
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import (
-    AccelerationRecord,
-    AnchorRangeRecord,
+    AccelerationMeasurement,
+    AnchorRangeMeasurement,
     Measurements,
-    PositionRecord,
-    RangeRecord,
-    SpeedRecord,
-    VelocityRecord,
+    PositionMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+    VelocityMeasurement,
 )
 from transport.messages.report_body import Diagnostics
 from transport.messages.uwb_body import UwbFrame, UwbRange, decode_uwb, encode_uwb_binary, encode_uwb_json
@@ -39,12 +39,12 @@ MESSAGES: list[Message] = [
     Measurements(
         9,
         (
-            PositionRecord(2, 9, (1.0, 2.0, 3.0), ONES, ONES),
-            VelocityRecord(2, 9, (1.0, 2.0, 3.0), ONES),
-            SpeedRecord(2, 9, 1.5, 0.25),
-            RangeRecord(2, 9, 3, 5.0, 0.25, 1.0),
-            AnchorRangeRecord(3, 8, (1.0, 2.0, 3.0), 4.0, 0.25),
-            AccelerationRecord(3, 8, (0.1, 0.2, 0.3), ONES),
+            PositionMeasurement(2, 9, (1.0, 2.0, 3.0), ONES, ONES),
+            VelocityMeasurement(2, 9, (1.0, 2.0, 3.0), ONES),
+            SpeedMeasurement(2, 9, 1.5, 0.25),
+            RangeMeasurement(2, 9, 3, 5.0, 0.25, 1.0),
+            AnchorRangeMeasurement(3, 8, (1.0, 2.0, 3.0), 4.0, 0.25),
+            AccelerationMeasurement(3, 8, (0.1, 0.2, 0.3), ONES),
         ),
     ),
     Information(9, 1, 8, 6, (1, 2), np.eye(12) + 0.5, np.ones(12)),

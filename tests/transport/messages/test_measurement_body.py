@@ -14,15 +14,15 @@ from transport.errors import EncodeError, Reason, Rejected
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 from transport.messages.measurement_body import (
     RECORD_BYTES,
-    AccelerationRecord,
-    AnchorRangeRecord,
+    AccelerationMeasurement,
+    AnchorRangeMeasurement,
+    Measurement,
+    MeasurementKind,
     Measurements,
-    PositionRecord,
-    RangeRecord,
-    Record,
-    RecordKind,
-    SpeedRecord,
-    VelocityRecord,
+    PositionMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+    VelocityMeasurement,
     as_sent,
     decode_measurements,
     encode_measurements,
@@ -49,30 +49,30 @@ widths = st.one_of(st.just(math.inf), st.floats(1e-6, 1e6))
 offsets = st.floats(-10, 10)
 
 positions = st.builds(
-    PositionRecord, ids, ticks, triples(numbers(1e6)), triples(variances), triples(widths), offsets
+    PositionMeasurement, ids, ticks, triples(numbers(1e6)), triples(variances), triples(widths), offsets
 )
 velocities = st.builds(
-    VelocityRecord, ids, ticks, triples(numbers(1e4)), triples(variances), triples(widths), offsets
+    VelocityMeasurement, ids, ticks, triples(numbers(1e4)), triples(variances), triples(widths), offsets
 )
-speeds = st.builds(SpeedRecord, ids, ticks, numbers(1e4), variances, widths, offsets)
-ranges = st.builds(RangeRecord, ids, ticks, ids, numbers(1e5), variances, widths, offsets).filter(
+speeds = st.builds(SpeedMeasurement, ids, ticks, numbers(1e4), variances, widths, offsets)
+ranges = st.builds(RangeMeasurement, ids, ticks, ids, numbers(1e5), variances, widths, offsets).filter(
     lambda record: record.observer != record.other
 )
 anchors = st.builds(
-    AnchorRangeRecord, ids, ticks, triples(numbers(1e6)), numbers(1e5), variances, widths, offsets
+    AnchorRangeMeasurement, ids, ticks, triples(numbers(1e6)), numbers(1e5), variances, widths, offsets
 )
-accelerations = st.builds(AccelerationRecord, ids, ticks, triples(numbers(1e4)), triples(variances))
+accelerations = st.builds(AccelerationMeasurement, ids, ticks, triples(numbers(1e4)), triples(variances))
 records = st.one_of(positions, velocities, speeds, ranges, anchors, accelerations)
 
-RANGE = RangeRecord(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
-SPEED = SpeedRecord(1, TICK, 1.5, 0.04)
+RANGE = RangeMeasurement(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
+SPEED = SpeedMeasurement(1, TICK, 1.5, 0.04)
 
 
 def flat(value: object) -> list[float]:
     return list(value) if isinstance(value, tuple) else [value]  # type: ignore[list-item]
 
 
-def round_trip(*given_records: Record) -> tuple[Record, ...]:
+def round_trip(*given_records: Measurement) -> tuple[Measurement, ...]:
     encoded = encode_measurements(Measurements(TICK, given_records), limit_bytes=100_000)
     assert encoded.left_out == 0
     return decode_measurements(encoded.body, tick=TICK, count=encoded.count, roster=ROSTER).records
@@ -80,7 +80,7 @@ def round_trip(*given_records: Record) -> tuple[Record, ...]:
 
 @settings(max_examples=400)
 @given(records)
-def test_a_record_comes_back_close_and_never_more_trusted(record: Record) -> None:
+def test_a_record_comes_back_close_and_never_more_trusted(record: Measurement) -> None:
     # WHEN a record crosses the wire
     (received,) = round_trip(record)
     # THEN ids and ticks are exact, values float32-close, and noise and bounds not smaller than they were
@@ -103,7 +103,7 @@ def test_a_record_comes_back_close_and_never_more_trusted(record: Record) -> Non
 
 @settings(max_examples=200)
 @given(records)
-def test_rounding_happens_once(record: Record) -> None:
+def test_rounding_happens_once(record: Measurement) -> None:
     # GIVEN a record as its receivers see it
     rounded = as_sent(record)
     # THEN relaying it changes nothing any more, and it is still the same measurement
@@ -113,7 +113,7 @@ def test_rounding_happens_once(record: Record) -> None:
 
 @settings(max_examples=100)
 @given(st.lists(records, max_size=60))
-def test_the_first_records_that_fit_are_sent(given_records: list[Record]) -> None:
+def test_the_first_records_that_fit_are_sent(given_records: list[Measurement]) -> None:
     encoded = encode_measurements(Measurements(TICK, tuple(given_records)))
     received = decode_measurements(encoded.body, tick=TICK, count=encoded.count, roster=ROSTER).records
     # THEN the body keeps its limit, what came is the beginning of what was given, and nothing vanished uncounted
@@ -128,13 +128,13 @@ def test_the_first_records_that_fit_are_sent(given_records: list[Record]) -> Non
 
 def test_one_packet_holds_several_ticks_of_a_mesh_of_five() -> None:
     # GIVEN an agent that measures position, speed, four ranges and its acceleration every tick
-    ticks_of_records: list[Record] = []
+    ticks_of_records: list[Measurement] = []
     for tick in range(TICK - 9, TICK + 1):
         ticks_of_records += [
-            PositionRecord(1, tick, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)),
-            SpeedRecord(1, tick, 1.0, 0.01),
-            *(RangeRecord(1, tick, other, 7.0, 0.01) for other in (2, 3, 4, 5)),
-            AccelerationRecord(1, tick, (0.1, 0.2, 0.3), (0.01, 0.01, 0.01)),
+            PositionMeasurement(1, tick, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)),
+            SpeedMeasurement(1, tick, 1.0, 0.01),
+            *(RangeMeasurement(1, tick, other, 7.0, 0.01) for other in (2, 3, 4, 5)),
+            AccelerationMeasurement(1, tick, (0.1, 0.2, 0.3), (0.01, 0.01, 0.01)),
         ]
     # THEN one datagram repairs the loss of six others
     encoded = encode_measurements(Measurements(TICK, tuple(ticks_of_records)))
@@ -144,8 +144,8 @@ def test_one_packet_holds_several_ticks_of_a_mesh_of_five() -> None:
 def test_no_older_record_slips_in_where_a_newer_one_did_not_fit() -> None:
     # GIVEN room for a speed and a bit more, then a position, then another speed, each a tick older
     older = replace(SPEED, tick=TICK - 2)
-    position = PositionRecord(1, TICK - 1, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0))
-    limit = 2 * RECORD_BYTES[RecordKind.SPEED]
+    position = PositionMeasurement(1, TICK - 1, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0))
+    limit = 2 * RECORD_BYTES[MeasurementKind.SPEED]
     encoded = encode_measurements(Measurements(TICK, (older, position, SPEED)), limit_bytes=limit)
     assert (encoded.count, encoded.left_out) == (1, 2)
 
@@ -175,12 +175,12 @@ def test_what_says_nothing_or_is_too_old_is_left_out_and_counted() -> None:
         replace(SPEED, observer=1000),
         replace(RANGE, other=1),
         replace(RANGE, other=1000),
-        AnchorRangeRecord(1, TICK, (math.nan, 0.0, 0.0), 1.0, 1.0),
-        PositionRecord(1, TICK, (0.0, 0.0, 2e6), (1.0, 1.0, 1.0)),
+        AnchorRangeMeasurement(1, TICK, (math.nan, 0.0, 0.0), 1.0, 1.0),
+        PositionMeasurement(1, TICK, (0.0, 0.0, 2e6), (1.0, 1.0, 1.0)),
     ],
 )
-def test_no_bad_record_is_sent(bad: Record) -> None:
-    with pytest.raises(EncodeError, match="Record"):
+def test_no_bad_record_is_sent(bad: Measurement) -> None:
+    with pytest.raises(EncodeError, match="Measurement"):
         encode_measurements(Measurements(TICK, (bad,)))
 
 
@@ -225,4 +225,4 @@ def test_an_empty_packet_is_a_sign_of_life() -> None:
 def test_the_wire_form_is_frozen() -> None:
     # GIVEN a record whose numbers are exact in the wire form; THEN its bytes are those of version 1
     encoded = encode_measurements(Measurements(TICK, (replace(RANGE, variance_m2=0.25, half_width_m=0.5),)))
-    assert encoded.body == struct.pack("<BHBfHfee", RecordKind.RANGE, 1, 0, 0.02, 2, 10.0, 0.5, 0.5)
+    assert encoded.body == struct.pack("<BHBfHfee", MeasurementKind.RANGE, 1, 0, 0.02, 2, 10.0, 0.5, 0.5)

@@ -16,7 +16,7 @@ from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, PacketKind
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements, PositionRecord, RangeRecord, SpeedRecord
+from transport.messages.measurement_body import Measurements, PositionMeasurement, RangeMeasurement, SpeedMeasurement
 from transport.messages.report_body import Diagnostics
 from transport.security.auth import UNSIGNED, Signing, Trust, sign, verify
 from transport.security.opening import Opener
@@ -30,7 +30,7 @@ TRUST = {agent_id: (key.verify_key,) for agent_id, key in KEYS.items()}
 T_NS = 1_800_000_000_000_000_000
 
 MEASUREMENTS = Measurements(
-    9, (SpeedRecord(2, 9, 1.5, 0.25), RangeRecord(2, 9, 3, 5.0, 0.25), SpeedRecord(3, 8, 2.5, 0.25))
+    9, (SpeedMeasurement(2, 9, 1.5, 0.25), RangeMeasurement(2, 9, 3, 5.0, 0.25), SpeedMeasurement(3, 8, 2.5, 0.25))
 )
 ESTIMATE = FleetEstimate(9, 0, (2, 3), np.arange(12.0), np.ones(12), (0, 1), np.eye(6))
 
@@ -124,7 +124,7 @@ def test_estimates_and_information_come_back() -> None:
 
 
 def test_a_full_measurement_packet_keeps_the_datagram_limit_and_counts_the_rest() -> None:
-    records = tuple(PositionRecord(2, t, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)) for t in range(99, -1, -1))
+    records = tuple(PositionMeasurement(2, t, (1.0, 2.0, 3.0), (1.0, 1.0, 1.0)) for t in range(99, -1, -1))
     sender = sealer()
     (packet,) = sender.seal(Measurements(99, records), t_ns=T_NS)
     assert len(packet.data) <= MAX_DATAGRAM_BYTES

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_bridge.studies.recording import REQUIRED, RecordingError, load_recording, recording_from_arrays
-from sim_bridge.studies.study_scenario import Scenario
+from sim_bridge.studies.study_input import REQUIRED, StudyInputError, load_recording, recording_from_arrays
+from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support.builders import recording_arrays
 
 Arrays = dict[str, Any]
@@ -19,7 +19,7 @@ Arrays = dict[str, Any]
 
 def test_round_trip(tmp_path: Path) -> None:
     # GIVEN a recording with everything in it
-    made = Scenario(graph="ring4", samples=6, blind=1).record(3, 0)
+    made = StudyScenario(graph="ring4", samples=6, blind=1).record(3, 0)
     made.received[2, 0, 1] = False
     made.delay_ticks[3, 1, 2] = 2
     path = tmp_path / "flight.npz"
@@ -150,7 +150,7 @@ def test_bad_array_is_refused(what: str, tmp_path: Path) -> None:
     path = tmp_path / "flight.npz"
     np.savez(path, **arrays)
     # WHEN it is read, THEN the error names the file, the key, what was expected and what was found, in one line
-    with pytest.raises(RecordingError, match=says) as caught:
+    with pytest.raises(StudyInputError, match=says) as caught:
         load_recording(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
@@ -160,7 +160,7 @@ def test_bad_array_is_refused(what: str, tmp_path: Path) -> None:
 def test_missing_key(key: str) -> None:
     arrays = recording_arrays()
     del arrays[key]
-    with pytest.raises(RecordingError, match=f"flight.npz: {key}: expected this key .*, found only "):
+    with pytest.raises(StudyInputError, match=f"flight.npz: {key}: expected this key .*, found only "):
         recording_from_arrays(arrays, "flight.npz")
 
 
@@ -175,10 +175,10 @@ def test_files_that_are_no_recording(tmp_path: Path) -> None:
     torn.write_bytes(torn.read_bytes()[:2000])
     empty = tmp_path / "empty.npz"
     empty.write_bytes(b"")
-    with pytest.raises(RecordingError, match=r"no\.npz: file: expected a recording .*, found no such file"):
+    with pytest.raises(StudyInputError, match=r"no\.npz: file: expected a recording .*, found no such file"):
         load_recording(missing)
     for path in (text, folder, torn, empty):
-        with pytest.raises(RecordingError, match=r"file: expected a recording \(\.npz") as caught:
+        with pytest.raises(StudyInputError, match=r"file: expected a recording \(\.npz") as caught:
             load_recording(path)
         assert "\n" not in str(caught.value)
 
@@ -186,7 +186,7 @@ def test_files_that_are_no_recording(tmp_path: Path) -> None:
 def test_single_array_is_no_recording(tmp_path: Path) -> None:
     array = tmp_path / "array.npy"
     np.save(array, np.zeros(3))
-    with pytest.raises(RecordingError, match=r"file: expected a recording \(\.npz"):
+    with pytest.raises(StudyInputError, match=r"file: expected a recording \(\.npz"):
         load_recording(array)
 
 
@@ -201,5 +201,5 @@ def test_pickled_arrays_are_not_loaded(tmp_path: Path) -> None:
     arrays["truth"] = np.array([Trap()], dtype=object)
     np.savez(path, **arrays)
     # THEN it is refused
-    with pytest.raises(RecordingError, match="without pickles"):
+    with pytest.raises(StudyInputError, match="without pickles"):
         load_recording(path)

@@ -12,21 +12,21 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.config.tables import FleetConfig, SensorsTable
-from agent.fleet.record_store import KEEP_TICKS, RecordStore
-from agent.fleet.records import acceleration_record, gps_records, inputs_of, range_record, rows_of
+from agent.fleet.measurement_store import KEEP_TICKS, MeasurementStore
+from agent.fleet.measurements import acceleration_measurement, gps_measurements, inputs_of, range_measurement, rows_of
 from agent.sensing.samples import GpsSample, RangeSample
 from agent.sensing.timeline import TickInput
 from estimators.model import measurements
 from estimators.model.measurements import Kind
 from tests.support.holding import held
 from transport.messages.measurement_body import (
-    AccelerationRecord,
-    AnchorRangeRecord,
-    PositionRecord,
-    RangeRecord,
-    Record,
-    SpeedRecord,
-    VelocityRecord,
+    AccelerationMeasurement,
+    AnchorRangeMeasurement,
+    Measurement,
+    PositionMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+    VelocityMeasurement,
 )
 
 SLOTS = {1: 0, 2: 1, 3: 2}
@@ -41,7 +41,7 @@ def fix(**changed: Any) -> GpsSample:
 
 
 def test_a_fix_becomes_rows_at_its_own_instant_with_the_receivers_accuracy() -> None:
-    records = gps_records(2, fix(), 0.1, SensorsTable())
+    records = gps_measurements(2, fix(), 0.1, SensorsTable())
     rows = rows_of(records, SLOTS)
     assert rows["tick"].tolist() == [100] * 5
     assert rows["offset_s"] == pytest.approx([0.03] * 5)
@@ -53,47 +53,47 @@ def test_a_fix_becomes_rows_at_its_own_instant_with_the_receivers_accuracy() -> 
 
 
 def test_the_variance_of_wandering_fixes_is_raised_by_its_factor() -> None:
-    rows = rows_of(gps_records(2, fix(), 0.1, SensorsTable(gps_variance_factor=20.0))[:1], SLOTS)
+    rows = rows_of(gps_measurements(2, fix(), 0.1, SensorsTable(gps_variance_factor=20.0))[:1], SLOTS)
     assert rows["variance"] == pytest.approx([5.0, 5.0, 12.8])
 
 
 def test_configured_half_widths_set_variance_and_bound() -> None:
     sensors = SensorsTable(gps_position_half_width_m=0.15, gps_speed_half_width_mps=0.08, uwb_bound_m=0.1)
-    records = gps_records(1, fix(ground_velocity_mps=None, speed_mps=5.0), 0.1, sensors)
+    records = gps_measurements(1, fix(ground_velocity_mps=None, speed_mps=5.0), 0.1, sensors)
     rows = rows_of(records, SLOTS)
     assert rows["kind"].tolist() == [Kind.POSITION] * 3 + [Kind.SPEED]
     assert rows["variance"] == pytest.approx([0.0075] * 3 + [0.08**2 / 3])
     assert rows["half_width"] == pytest.approx([0.15] * 3 + [0.08])
-    ranged = rows_of([range_record(RangeSample(10.07, 1, 3, 12.5, 0.3), 0.1, sensors)], SLOTS)
+    ranged = rows_of([range_measurement(RangeSample(10.07, 1, 3, 12.5, 0.3), 0.1, sensors)], SLOTS)
     assert ranged["variance"] == pytest.approx([0.01 / 3])
     assert (ranged["agent"][0], ranged["other"][0], ranged["value"][0]) == (0, 2, 12.5)
     assert (ranged["tick"][0], ranged["offset_s"][0]) == (101, pytest.approx(-0.03))
 
 
 def test_a_flat_fix_says_nothing_of_the_height() -> None:
-    rows = rows_of(gps_records(1, fix(fix_type=2), 0.1, SensorsTable(gps_min_fix=2))[:1], SLOTS)
+    rows = rows_of(gps_measurements(1, fix(fix_type=2), 0.1, SensorsTable(gps_min_fix=2))[:1], SLOTS)
     assert rows["z"].tolist() == [0, 0]
 
 
 def test_anchors_and_accelerations_keep_their_numbers() -> None:
-    anchored = rows_of([AnchorRangeRecord(3, 7, (1, 2, 3), 9.0, 0.04)], SLOTS)
+    anchored = rows_of([AnchorRangeMeasurement(3, 7, (1, 2, 3), 9.0, 0.04)], SLOTS)
     assert (anchored["kind"][0], anchored["x"][0], anchored["agent"][0]) == (Kind.ANCHOR_RANGE, 1.0, 2)
     closed = TickInput(7, (0.1, 0.2, 0.3), (0.01, 0.01, 0.01), 1.0, 10)
-    table = inputs_of([acceleration_record(2, closed)], SLOTS)
+    table = inputs_of([acceleration_measurement(2, closed)], SLOTS)
     assert table["accel"].tolist() == [[0.1, 0.2, 0.3]]
     assert (table["tick"][0], table["agent"][0]) == (7, 1)
     with pytest.raises(TypeError, match="not a measurement"):
-        rows_of([acceleration_record(2, closed)], SLOTS)
+        rows_of([acceleration_measurement(2, closed)], SLOTS)
 
 
 def test_rows_are_those_of_the_estimators_builders() -> None:
     bounds = (0.5, 0.6, math.inf)
-    records: list[Record] = [
-        PositionRecord(2, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), bounds, 0.01),
-        VelocityRecord(3, 8, (4.0, 5.0, 6.0), (0.4, 0.5, 0.6), bounds, -0.01),
-        SpeedRecord(1, 9, 7.0, 0.7, 0.8, 0.02),
-        RangeRecord(1, 10, 3, 8.0, 0.8, 0.9, 0.03),
-        AnchorRangeRecord(3, 11, (1.0, 2.0, 3.0), 9.0, 0.9, 1.0, 0.04),
+    records: list[Measurement] = [
+        PositionMeasurement(2, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3), bounds, 0.01),
+        VelocityMeasurement(3, 8, (4.0, 5.0, 6.0), (0.4, 0.5, 0.6), bounds, -0.01),
+        SpeedMeasurement(1, 9, 7.0, 0.7, 0.8, 0.02),
+        RangeMeasurement(1, 10, 3, 8.0, 0.8, 0.9, 0.03),
+        AnchorRangeMeasurement(3, 11, (1.0, 2.0, 3.0), 9.0, 0.9, 1.0, 0.04),
     ]
     built = [
         measurements.position_rows(7, 1, (1, 2, 3), (0.1, 0.2, 0.3), offset_s=0.01, half_width_m=bounds),
@@ -104,19 +104,19 @@ def test_rows_are_those_of_the_estimators_builders() -> None:
     ]
     assert rows_of(records, SLOTS).tolist() == np.concatenate(built).tolist()
     assert rows_of([], SLOTS).dtype == measurements.ROW
-    pushes = inputs_of([AccelerationRecord(3, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))], SLOTS)
+    pushes = inputs_of([AccelerationMeasurement(3, 7, (1.0, 2.0, 3.0), (0.1, 0.2, 0.3))], SLOTS)
     built_pushes = measurements.input_rows(7, 2, (1, 2, 3), (0.1, 0.2, 0.3))
     for name in measurements.INPUT.names or ():
         assert pushes[name].tolist() == built_pushes[name].tolist()
     assert inputs_of([], SLOTS).dtype == measurements.INPUT
 
 
-def position(observer: int, tick: int, north_m: float = 1.0, offset_s: float = 0.0) -> PositionRecord:
-    return PositionRecord(observer, tick, (north_m, 0.0, 0.0), (0.1, 0.1, 0.1), offset_s=offset_s)
+def position(observer: int, tick: int, north_m: float = 1.0, offset_s: float = 0.0) -> PositionMeasurement:
+    return PositionMeasurement(observer, tick, (north_m, 0.0, 0.0), (0.1, 0.1, 0.1), offset_s=offset_s)
 
 
-def acceleration(observer: int, tick: int) -> AccelerationRecord:
-    return AccelerationRecord(observer, tick, (1.0, 0.0, 0.0), (0.1, 0.1, 0.1))
+def acceleration(observer: int, tick: int) -> AccelerationMeasurement:
+    return AccelerationMeasurement(observer, tick, (1.0, 0.0, 0.0), (0.1, 0.1, 0.1))
 
 
 def line(make_config: Callable[..., FleetConfig], count: int = 4, *overrides: str) -> FleetConfig:
@@ -131,7 +131,7 @@ IDS = (1, 2, 3)
 def test_each_record_is_handed_out_once_and_inputs_only_when_they_have_acted(
     make_config: Callable[..., FleetConfig],
 ) -> None:
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     store.neighbourhood.hear(2, 5)
     for _ in range(3):
         store.add_own(position(1, 5))
@@ -149,7 +149,7 @@ def test_each_record_is_handed_out_once_and_inputs_only_when_they_have_acted(
 
 def test_a_record_is_taken_in_once_however_often_it_comes(make_config: Callable[..., FleetConfig]) -> None:
     # GIVEN all hear all, WHEN packets repeat records among new ones
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     for other in (2, 3):
         store.neighbourhood.hear(other, 6)
     own = store.add_own(position(1, 6))
@@ -166,7 +166,7 @@ def test_a_record_is_taken_in_once_however_often_it_comes(make_config: Callable[
 
 
 def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig]) -> None:
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     store.neighbourhood.hear(2, 20)
     store.take(20, IDS, IDS)
     store.add_heard(2, [position(2, 18, offset_s=0.04)], 20)
@@ -176,7 +176,7 @@ def test_late_records_keep_their_own_tick(make_config: Callable[..., FleetConfig
 
 
 def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[..., FleetConfig]) -> None:
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     store.neighbourhood.hear(2, 100)
     assert not store.add_heard(2, [position(2, 100 - 65)], 100)
     assert not store.add_heard(2, [position(2, 103)], 100)
@@ -185,7 +185,7 @@ def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[.
     assert dict(store.refused) == {"heard: too old": 1, "heard: of the future": 1}
 
 
-def told(store: RecordStore, tick: int, *neighbours: int) -> list[tuple[int, int]]:
+def told(store: MeasurementStore, tick: int, *neighbours: int) -> list[tuple[int, int]]:
     """(observer, tick) of what a packet says, in its order."""
     return [(record.observer, record.tick) for record in store.packet(tick, 0, neighbours).records]
 
@@ -193,7 +193,7 @@ def told(store: RecordStore, tick: int, *neighbours: int) -> list[tuple[int, int
 def test_while_nobody_is_heard_packets_repeat_the_last_ticks_newest_first(
     make_config: Callable[..., FleetConfig],
 ) -> None:
-    store = RecordStore(make_config(3, "transport.history_ticks=3", "estimator.share_inputs=none"), 1)
+    store = MeasurementStore(make_config(3, "transport.history_ticks=3", "estimator.share_inputs=none"), 1)
     for tick in range(10):
         store.add_own(position(1, tick))
         store.add_own(acceleration(1, tick))
@@ -204,7 +204,7 @@ def test_while_nobody_is_heard_packets_repeat_the_last_ticks_newest_first(
 
 def test_a_record_is_told_until_every_neighbour_has_said_it(make_config: Callable[..., FleetConfig]) -> None:
     # GIVEN drone 2 between 1 and 3
-    store = RecordStore(line(make_config, 3, "estimator.relay_hops=1"), 2)
+    store = MeasurementStore(line(make_config, 3, "estimator.relay_hops=1"), 2)
     store.add_own(position(2, 5))
     store.add_heard(1, [position(1, 5)], 5)
     # THEN its own record goes to both, that of 1 is for 3
@@ -224,7 +224,7 @@ def test_a_record_is_told_until_every_neighbour_has_said_it(make_config: Callabl
 
 def test_what_is_heard_is_said_back_once_behind_what_is_lacked(make_config: Callable[..., FleetConfig]) -> None:
     # GIVEN an end of a line, that relays to nobody
-    store = RecordStore(line(make_config, 3, "estimator.relay_hops=0"), 1)
+    store = MeasurementStore(line(make_config, 3, "estimator.relay_hops=0"), 1)
     store.add_heard(2, [position(2, 5), position(2, 4)], 5)
     store.add_own(position(1, 5))
     # THEN its packet holds its own record and the echoes, the next one its own alone
@@ -252,7 +252,7 @@ def test_whose_records_are_used_follows_hops_and_sharing(
     accelerations: list[int],
 ) -> None:
     config = line(make_config, 5, f"estimator.relay_hops={relay_hops}", f"estimator.share_inputs={share}")
-    hood = RecordStore(config, 2).neighbourhood
+    hood = MeasurementStore(config, 2).neighbourhood
     assert [hood.hops(i) for i in range(1, 6)] == [1, 0, 1, 2, 3]
     assert [i for i in range(1, 6) if hood.uses(position(i, 1))] == positions
     assert [i for i in range(1, 6) if hood.uses(acceleration(i, 1))] == accelerations
@@ -262,9 +262,9 @@ def test_whose_records_are_used_follows_hops_and_sharing(
 
 
 def test_our_own_numbers_are_those_that_others_get(make_config: Callable[..., FleetConfig]) -> None:
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     rounded = store.add_own(position(1, 5, north_m=1 / 3))
-    assert isinstance(rounded, PositionRecord)
+    assert isinstance(rounded, PositionMeasurement)
     assert rounded.position_m[0] == float(np.float32(1 / 3))
     assert store.take(5, IDS, IDS)[0]["value"][0] == rounded.position_m[0]
     assert store.add_own(position(1, 6, north_m=1e7)) is None
@@ -273,20 +273,20 @@ def test_our_own_numbers_are_those_that_others_get(make_config: Callable[..., Fl
 
 @given(st.floats(0, 1e7), st.floats(-1, 1))
 def test_tick_and_offset_add_up_to_the_instant(t_s: float, sign: float) -> None:
-    record = range_record(RangeSample(t_s, 1, 2, 5.0, 0.1), 0.1, SensorsTable())
+    record = range_measurement(RangeSample(t_s, 1, 2, 5.0, 0.1), 0.1, SensorsTable())
     assert record.tick * 0.1 + record.offset_s == pytest.approx(t_s, abs=1e-6)
     assert abs(record.offset_s) <= 0.05 + 1e-6
 
 
 def test_memory_stays_bounded(make_config: Callable[..., FleetConfig]) -> None:
-    store = RecordStore(make_config(), 1)
+    store = MeasurementStore(make_config(), 1)
     for tick in range(1000):
         store.add_own(position(1, tick))
-        store.add_heard(2, [RangeRecord(2, tick, 3, 4.0, 0.1)], tick)
-        store.add_heard(3, [VelocityRecord(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
+        store.add_heard(2, [RangeMeasurement(2, tick, 3, 4.0, 0.1)], tick)
+        store.add_heard(3, [VelocityMeasurement(3, tick, (0, 0, 0), (0.1, 0.1, math.pi))], tick)
         store.take(tick, IDS, IDS)
     kept = held(store)
-    for kind in (PositionRecord, RangeRecord, VelocityRecord):
+    for kind in (PositionMeasurement, RangeMeasurement, VelocityMeasurement):
         assert kept[kind] <= KEEP_TICKS + 2
 
 
@@ -294,11 +294,11 @@ def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_t
     make_config: Callable[..., FleetConfig],
 ) -> None:
     # GIVEN a fix of 3 and ranges 1-3 and 1-2, WHEN 2 is no member and 3 is not located yet
-    store = RecordStore(make_config(3, "estimator.window=4"), 1)
+    store = MeasurementStore(make_config(3, "estimator.window=4"), 1)
     store.neighbourhood.hear(3, 10)
     store.add_heard(3, [position(3, 10)], 10)
-    store.add_own(RangeRecord(1, 10, 3, 4.0, 0.1))
-    store.add_own(RangeRecord(1, 10, 2, 5.0, 0.1))
+    store.add_own(RangeMeasurement(1, 10, 3, 4.0, 0.1))
+    store.add_own(RangeMeasurement(1, 10, 2, 5.0, 0.1))
     store.add_own(acceleration(1, 9))
     store.add_heard(3, [acceleration(3, 9)], 10)
     rows, inputs = store.take(10, (1,), (1,))
@@ -315,7 +315,9 @@ def test_rows_wait_until_everybody_they_name_is_located_and_slots_are_those_of_t
 
 
 def test_without_edges_a_neighbour_is_who_was_heard_of_late(make_config: Callable[..., FleetConfig]) -> None:
-    hood = RecordStore(make_config(3, "transport.neighbour_timeout_s=2.0", "estimator.relay_hops=1"), 1).neighbourhood
+    hood = MeasurementStore(
+        make_config(3, "transport.neighbour_timeout_s=2.0", "estimator.relay_hops=1"), 1
+    ).neighbourhood
     assert [hood.hops(i) for i in IDS] == [0, 2, 2]
     hood.hear(2, 100)
     assert [hood.hops(i) for i in IDS] == [0, 1, 2]

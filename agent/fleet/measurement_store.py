@@ -8,14 +8,14 @@ from collections.abc import Collection, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
-from agent.fleet.records import inputs_of, rows_of
+from agent.fleet.measurements import inputs_of, rows_of
 from estimators.model.measurements import InputTable, RowTable
 from transport.errors import EncodeError
 from transport.messages.measurement_body import (
-    AccelerationRecord,
+    AccelerationMeasurement,
+    Measurement,
     Measurements,
-    RangeRecord,
-    Record,
+    RangeMeasurement,
     as_sent,
     identity,
 )
@@ -65,16 +65,16 @@ class Neighbourhood:
         heard = self._heard.get(agent_id)
         return 1 if heard is not None and self._tick - heard <= self._recent_ticks else 2
 
-    def uses(self, record: Record) -> bool:
+    def uses(self, record: Measurement) -> bool:
         """Whether this agent's estimator takes the record."""
         hops = self.hops(record.observer)
-        limit = self._inputs_from if isinstance(record, AccelerationRecord) else self._rows_from
+        limit = self._inputs_from if isinstance(record, AccelerationMeasurement) else self._rows_from
         return hops is not None and hops <= limit
 
-    def sends(self, record: Record) -> bool:
+    def sends(self, record: Measurement) -> bool:
         """Whether this agent tells its neighbours: its own records, and others' that are relayed so far."""
         hops = self.hops(record.observer)
-        limit = self._inputs_to if isinstance(record, AccelerationRecord) else self._rows_to
+        limit = self._inputs_to if isinstance(record, AccelerationMeasurement) else self._rows_to
         return hops is not None and hops <= limit
 
 
@@ -82,11 +82,11 @@ class Neighbourhood:
 class _OnItsWay:
     """A record that is sent on, and the neighbours that are known to have it: it was in their packets."""
 
-    record: Record
+    record: Measurement
     held_by: set[int] = field(default_factory=set)
 
 
-class RecordStore:
+class MeasurementStore:
     """Records by tick, own and heard; ``refused`` counts those not taken, by reason.
 
     A packet brings first what some neighbour may lack: a record that was in a neighbour's packet is one that it has.
@@ -98,17 +98,17 @@ class RecordStore:
         self._history_ticks = config.transport.history_ticks
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
-        self._seen: dict[int, dict[object, Record]] = {}
+        self._seen: dict[int, dict[object, Measurement]] = {}
         """The records taken in, by tick and identity."""
         self._to_send: dict[int, tuple[dict[object, _OnItsWay], dict[object, _OnItsWay]]] = {}
         """Own and relayed records by tick, each by its identity."""
-        self._echoes: dict[object, Record] = {}
+        self._echoes: dict[object, Measurement] = {}
         """What was heard since the last packet, by its identity."""
-        self._rows: list[Record] = []
-        self._inputs: list[AccelerationRecord] = []
+        self._rows: list[Measurement] = []
+        self._inputs: list[AccelerationMeasurement] = []
         self.refused: Counter[str] = Counter()
 
-    def add_own(self, record: Record) -> Record | None:
+    def add_own(self, record: Measurement) -> Measurement | None:
         """Take in a record of our own sensors; it comes back as the wire rounds it, ``None`` if refused."""
         try:
             rounded = as_sent(record)
@@ -117,7 +117,7 @@ class RecordStore:
             return None
         return rounded if self._add(rounded, identity(rounded)) else None
 
-    def add_heard(self, sender: int, records: Iterable[Record], tick: int) -> list[Record]:
+    def add_heard(self, sender: int, records: Iterable[Measurement], tick: int) -> list[Measurement]:
         """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
         taken = []
         for record in records:
@@ -129,7 +129,7 @@ class RecordStore:
             self._note_holder(sender, record)
         return taken
 
-    def _note_holder(self, sender: int, record: Record) -> None:
+    def _note_holder(self, sender: int, record: Measurement) -> None:
         for part in self._to_send.get(record.tick, ()):
             sent = part.get(identity(record))
             if sent is not None:
@@ -143,14 +143,14 @@ class RecordStore:
         """
         slots = {agent: slot for slot, agent in enumerate(members)}
         usable = {agent for agent in members if agent in located}
-        rows: list[Record] = []
-        inputs: list[AccelerationRecord] = []
-        later: list[Record] = []
+        rows: list[Measurement] = []
+        inputs: list[AccelerationMeasurement] = []
+        later: list[Measurement] = []
         for record in self._rows:
-            end = record.other if isinstance(record, RangeRecord) else record.observer
+            end = record.other if isinstance(record, RangeMeasurement) else record.observer
             ready = record.tick <= tick and record.observer in usable and end in usable
             (rows if ready else later).append(record)
-        later_inputs: list[AccelerationRecord] = []
+        later_inputs: list[AccelerationMeasurement] = []
         for push in self._inputs:
             (inputs if push.tick < tick and push.observer in slots else later_inputs).append(push)
         self._rows, self._inputs = later, later_inputs
@@ -174,7 +174,7 @@ class RecordStore:
 
         While nobody is heard all of the last ticks goes out.
         """
-        lacked: dict[object, Record] = {}
+        lacked: dict[object, Measurement] = {}
         for of_tick in range(tick, tick - self._history_ticks, -1):
             for part in self._to_send.get(of_tick, ()):
                 for name, sent in part.items():
@@ -193,7 +193,7 @@ class RecordStore:
                     return True
         return False
 
-    def _wanted(self, record: Record, tick: int) -> bool:
+    def _wanted(self, record: Measurement, tick: int) -> bool:
         """Whether a record that a neighbour sent is one to take in, if it is new."""
         if record.observer == self._agent_id:
             return False  # our own words, relayed back
@@ -208,7 +208,7 @@ class RecordStore:
             return False
         return True
 
-    def _add(self, record: Record, name: object) -> bool:
+    def _add(self, record: Measurement, name: object) -> bool:
         """Take in a record by its identity; false if it is there already."""
         seen = self._seen.setdefault(record.tick, {})
         if name in seen:
@@ -217,7 +217,7 @@ class RecordStore:
         if self.neighbourhood.sends(record):
             own, relayed = self._to_send.setdefault(record.tick, ({}, {}))
             (own if record.observer == self._agent_id else relayed)[name] = _OnItsWay(record)
-        if isinstance(record, AccelerationRecord):
+        if isinstance(record, AccelerationMeasurement):
             self._inputs.append(record)
         else:
             self._rows.append(record)

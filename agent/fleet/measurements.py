@@ -21,13 +21,13 @@ from agent.sensing.timeline import TickInput, nearest_tick
 from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
 from transport.messages.measurement_body import (
     NO_BOUND,
-    AccelerationRecord,
-    AnchorRangeRecord,
-    PositionRecord,
-    RangeRecord,
-    Record,
-    SpeedRecord,
-    VelocityRecord,
+    AccelerationMeasurement,
+    AnchorRangeMeasurement,
+    Measurement,
+    PositionMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+    VelocityMeasurement,
 )
 
 UNMEASURED_VARIANCE = 1e6
@@ -40,7 +40,7 @@ _NED: tuple[Triple, Triple, Triple] = ((1.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, 0
 _NOWHERE: Triple = (0.0, 0.0, 0.0)
 
 
-def gps_records(observer: int, sample: GpsSample, period_s: float, sensors: SensorsTable) -> list[Record]:
+def gps_measurements(observer: int, sample: GpsSample, period_s: float, sensors: SensorsTable) -> list[Measurement]:
     """Position and speed (or horizontal velocity) of a fix; configured half widths replace its accuracies."""
     tick = nearest_tick(sample.t_s, period_s)
     offset_s = sample.t_s - tick * period_s
@@ -55,42 +55,42 @@ def gps_records(observer: int, sample: GpsSample, period_s: float, sensors: Sens
     if sample.fix_type < THREE_D_FIX:
         vertical = UNMEASURED_VARIANCE
     variance = (horizontal, horizontal, vertical)
-    position = PositionRecord(observer, tick, sample.position_m, variance, bounds, offset_s)
+    position = PositionMeasurement(observer, tick, sample.position_m, variance, bounds, offset_s)
     return [position, *_speed_records(observer, tick, offset_s, sample, sensors)]
 
 
 def _speed_records(
     observer: int, tick: int, offset_s: float, sample: GpsSample, sensors: SensorsTable
-) -> list[Record]:
+) -> list[Measurement]:
     half_width = sensors.gps_speed_half_width_mps
     variance = sample.speed_sigma_mps**2 if half_width is None else half_width**2 / 3
     bound = math.inf if half_width is None else half_width
     if sample.speed_mps is not None:
-        return [SpeedRecord(observer, tick, sample.speed_mps, variance, bound, offset_s)]
+        return [SpeedMeasurement(observer, tick, sample.speed_mps, variance, bound, offset_s)]
     if sample.ground_velocity_mps is not None:
         north, east = sample.ground_velocity_mps
         variances = (variance, variance, UNMEASURED_VARIANCE)
         bounds = (bound, bound, math.inf)
-        return [VelocityRecord(observer, tick, (north, east, 0.0), variances, bounds, offset_s)]
+        return [VelocityMeasurement(observer, tick, (north, east, 0.0), variances, bounds, offset_s)]
     return []
 
 
-def range_record(sample: RangeSample, period_s: float, sensors: SensorsTable) -> RangeRecord:
+def range_measurement(sample: RangeSample, period_s: float, sensors: SensorsTable) -> RangeMeasurement:
     """The record of a range; a configured bound replaces its accuracy."""
     tick = nearest_tick(sample.t_s, period_s)
     bound = sensors.uwb_bound_m
     variance = sample.sigma_m**2 if bound is None else bound**2 / 3
     half_width = math.inf if bound is None else bound
     offset_s = sample.t_s - tick * period_s
-    return RangeRecord(sample.observer, tick, sample.target, sample.range_m, variance, half_width, offset_s)
+    return RangeMeasurement(sample.observer, tick, sample.target, sample.range_m, variance, half_width, offset_s)
 
 
-def acceleration_record(observer: int, closed: TickInput) -> AccelerationRecord:
+def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
     """The record of a tick's averaged acceleration."""
-    return AccelerationRecord(observer, closed.tick, closed.accel_mps2, closed.variance)
+    return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)
 
 
-def rows_of(records: Iterable[Record], slots: Mapping[int, int]) -> RowTable:
+def rows_of(records: Iterable[Measurement], slots: Mapping[int, int]) -> RowTable:
     """The rows of records of sensors, in their order; ``slots`` by agent id.
 
     All in one table at once: numpy takes as long for a table of one row as for ten. Raises `TypeError` for an
@@ -100,27 +100,27 @@ def rows_of(records: Iterable[Record], slots: Mapping[int, int]) -> RowTable:
     for record in records:
         tick, slot = record.tick, slots[record.observer]
         match record:
-            case PositionRecord(_, _, value, variance, half_width, offset_s):
+            case PositionMeasurement(_, _, value, variance, half_width, offset_s):
                 axes = zip(value, variance, half_width, _NED, strict=True)
                 rows += _axis_rows(Kind.POSITION, tick, offset_s, slot, axes)
-            case VelocityRecord(_, _, value, variance, half_width, offset_s):
+            case VelocityMeasurement(_, _, value, variance, half_width, offset_s):
                 axes = zip(value, variance, half_width, _NED, strict=True)
                 rows += _axis_rows(Kind.VELOCITY, tick, offset_s, slot, axes)
-            case SpeedRecord():
+            case SpeedMeasurement():
                 noise = record.variance_m2ps2, record.half_width_mps
                 rows.append((tick, record.offset_s, record.speed_mps, *noise, *_NOWHERE, Kind.SPEED, slot, -1, slot))
-            case RangeRecord():
+            case RangeMeasurement():
                 noise, other = (record.variance_m2, record.half_width_m), slots[record.other]
                 rows.append((tick, record.offset_s, record.range_m, *noise, *_NOWHERE, Kind.RANGE, slot, other, slot))
-            case AnchorRangeRecord():
+            case AnchorRangeMeasurement():
                 noise, kind = (record.variance_m2, record.half_width_m), Kind.ANCHOR_RANGE
                 rows.append((tick, record.offset_s, record.range_m, *noise, *record.anchor_m, kind, slot, -1, slot))
-            case AccelerationRecord():
+            case AccelerationMeasurement():
                 raise TypeError(f"an acceleration is an input, not a measurement: {record}")
     return np.array(rows, ROW)
 
 
-def inputs_of(records: Iterable[AccelerationRecord], slots: Mapping[int, int]) -> InputTable:
+def inputs_of(records: Iterable[AccelerationMeasurement], slots: Mapping[int, int]) -> InputTable:
     """The inputs of records, in their order; ``slots`` by agent id."""
     return np.array(
         [(record.tick, record.accel_mps2, record.variance_m2ps4, slots[record.observer]) for record in records], INPUT

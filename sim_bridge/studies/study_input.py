@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 
-class RecordingError(ValueError):
+class StudyInputError(ValueError):
     """A recording that cannot be used: names file, key, what was expected and what was found."""
 
     def __init__(self, source: str, key: str, expected: str, found: str) -> None:
@@ -26,7 +26,7 @@ class RecordingError(ValueError):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Recording:
+class StudyInput:
     """What a fleet measured, tick by tick.
 
     Attributes
@@ -89,20 +89,20 @@ REQUIRED = (
 OPTIONAL = ("received", "delay_ticks", "truth")
 
 
-def load_recording(path: Path) -> Recording:
-    """Read and check a recording; raises `RecordingError`."""
+def load_recording(path: Path) -> StudyInput:
+    """Read and check a recording; raises `StudyInputError`."""
     try:
         with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
     except FileNotFoundError:
-        raise RecordingError(str(path), "file", "a recording (.npz)", "no such file") from None
+        raise StudyInputError(str(path), "file", "a recording (.npz)", "no such file") from None
     except (ValueError, OSError, BadZipFile, EOFError, KeyError) as error:
-        raise RecordingError(str(path), "file", "a recording (.npz without pickles)", str(error)) from None
+        raise StudyInputError(str(path), "file", "a recording (.npz without pickles)", str(error)) from None
     return recording_from_arrays(arrays, str(path))
 
 
-def recording_from_arrays(arrays: Mapping[str, Any], source: str) -> Recording:
-    """Check arrays against the format and make a recording of them; raises `RecordingError` naming ``source``."""
+def recording_from_arrays(arrays: Mapping[str, Any], source: str) -> StudyInput:
+    """Check arrays against the format and make a recording of them; raises `StudyInputError` naming ``source``."""
     check = _Checker(arrays, source)
     period_s = check.number("period_s", positive=True)
     agents = check.agents()
@@ -115,8 +115,8 @@ def recording_from_arrays(arrays: Mapping[str, Any], source: str) -> Recording:
     received = check.optional("received", (ticks + 1, n, n), np.ones((ticks + 1, n, n), bool))
     delay = check.optional("delay_ticks", (ticks + 1, n, n), np.zeros((ticks + 1, n, n), np.int64))
     if (delay < 0).any():
-        raise RecordingError(source, "delay_ticks", "no negative delay", f"{int(delay.min())}")
-    return Recording(
+        raise StudyInputError(source, "delay_ticks", "no negative delay", f"{int(delay.min())}")
+    return StudyInput(
         period_s=period_s,
         agents=agents,
         edges=edges,
@@ -141,8 +141,8 @@ class _Checker:
     arrays: Mapping[str, Any]
     source: str
 
-    def fail(self, key: str, expected: str, found: str) -> RecordingError:
-        return RecordingError(self.source, key, expected, found)
+    def fail(self, key: str, expected: str, found: str) -> StudyInputError:
+        return StudyInputError(self.source, key, expected, found)
 
     def raw(self, key: str) -> NDArray[Any]:
         if key not in self.arrays:

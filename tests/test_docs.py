@@ -6,9 +6,8 @@ import importlib
 import re
 import shlex
 import tomllib
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import msgspec
 import pytest
@@ -26,36 +25,15 @@ from fleetloc import UwbFrame, encode_uwb_json
 from fleetloc.cli import build_app
 from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
+from tests.support.doc_pages import DOCS, FENCE, PAGES, ROOT, Block, blocks, written_commands
 from transport.errors import Reason
 
-ROOT = Path(__file__).parents[1]
-DOCS = ROOT / "docs"
-PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", ROOT / "CHANGELOG.md", *sorted(DOCS.glob("*.md"))]
 SITE = ROOT / "mkdocs.yml"
-FENCE = re.compile(r"^(?P<indent> *)```(?P<language>\w*)\n(?P<text>.*?)^(?P=indent)```", re.MULTILINE | re.DOTALL)
-INLINE = re.compile(r"`(fleetloc [^`\n]+)`")
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
-SHELL = ("sh", "bash", "console", "")
 ROOMS = "configs|tests|estimators|transport|agent|sim_bridge|fleetloc"
 OURS = re.compile(rf"(?<![\w/.])(?:{ROOMS})/(?:[\w-]+/)*[\w-]+\.(?:py|toml)\b")
 CONTROL = ("|", "&", "&&", "||", ";", ">", "<", "2>", "#", "\\")
 TABLES = {field.name for field in msgspec.structs.fields(FleetConfig)} - {"others"} | OTHER_TABLES.keys()
-
-
-class Block(NamedTuple):
-    """One fenced block of a page."""
-
-    page: str
-    language: str
-    text: str
-
-
-def blocks() -> list[Block]:
-    return [
-        Block(page.name, found["language"], re.sub(rf"^{found['indent']}", "", found["text"], flags=re.MULTILINE))
-        for page in PAGES
-        for found in FENCE.finditer(page.read_text(encoding="utf-8"))
-    ]
 
 
 def prose(page: Path) -> str:
@@ -98,21 +76,6 @@ def test_pictures_are_small() -> None:
 
 
 # --- commands -------------------------------------------------------------------------------------------------
-
-
-def written_commands() -> Iterator[tuple[str, str]]:
-    """(page, what follows ``fleetloc``) of every command in a shell block or in the text."""
-    for block in blocks():
-        if block.language in SHELL:
-            joined = block.text.replace("\\\n", " ")
-            for line in joined.splitlines():
-                found = re.match(r"(?:\$ )?(?:\w+=\S+ )*(?:\S*/)?fleetloc (.+)", line.strip())
-                if found:
-                    yield block.page, found[1]
-    for page in PAGES:
-        text = FENCE.sub("", page.read_text(encoding="utf-8"))
-        for found in INLINE.finditer(text):
-            yield page.name, found[1].removeprefix("fleetloc ")
 
 
 def complaint(app: Any, text: str) -> str | None:

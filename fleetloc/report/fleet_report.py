@@ -81,16 +81,19 @@ def report_figures(
 
 def _of_track(track: AgentTrack) -> dict[str, Any]:
     known, settled = track.known, track.known & (track.time_s >= SETTLED_S)
+    served, later = track.served, track.served.time_s >= SETTLED_S
     return {
         "id": track.agent_id,
         "ticks_expected": track.ticks_expected,
         "ticks_on_time": int(np.count_nonzero(track.on_time)),
-        "ticks_without_estimate": int(np.count_nonzero(~known)),
+        "ticks_without_estimate": track.ticks_expected - int(np.count_nonzero(known)),
         "daemons": track.records,
-        "position_rmse_m": _rms(track.own_error_m[known]),
-        "position_rmse_after_10s_m": _rms(track.own_error_m[settled]),
-        "norm_full_rms": _rms(track.full_error[known]),
-        "norm_full_rms_after_10s": _rms(track.full_error[settled]),
+        "availability": served.availability(),
+        "availability_after_10s": served.availability(SETTLED_S),
+        "position_rmse_m": _rms(served.own_error_m),
+        "position_rmse_after_10s_m": _rms(served.own_error_m[later]),
+        "norm_full_rms": _rms(served.full_error),
+        "norm_full_rms_after_10s": _rms(served.full_error[later]),
         "anees": _mean(track.nees[known]),
         "anees_after_10s": _mean(track.nees[settled]),
         "tick_time_p50_s": _percentile(track.tick_time_s, 50),
@@ -157,7 +160,8 @@ def _of_fleet(results: FleetResults, agents: list[dict[str, Any]]) -> dict[str, 
         "ticks_on_time_fraction": on_time / expected if expected else None,
         **{key: _root_mean_square(agent[key] for agent in agents) for key in
            ("position_rmse_m", "position_rmse_after_10s_m", "norm_full_rms", "norm_full_rms_after_10s")},
-        **{key: _mean_known(agent[key] for agent in agents) for key in ("anees", "anees_after_10s")},
+        **{key: _mean_known(agent[key] for agent in agents) for key in
+           ("anees", "anees_after_10s", "availability", "availability_after_10s")},
         "tick_time_p50_s": _percentile(times, 50),
         "tick_time_p99_s": _percentile(times, 99),
         "cpu_fraction": _sum_known(agent["cpu_fraction"] for agent in agents),
@@ -217,12 +221,13 @@ def _shown(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
 
 
 def _print(figures: dict[str, Any]) -> None:
-    columns = ["agent", "ticks on time", "RMSE m", "after 10 s", "fleet error", "ANEES"]
+    columns = ["agent", "ticks on time", "available %", "RMSE m", "after 10 s", "fleet error", "ANEES"]
     columns += ["tick p50/p99 ms", "CPU %", "MB"]
     rows = [
         [
             str(row.get("id", "fleet")),
             f"{row['ticks_on_time']}/{row['ticks_expected']}",
+            _shown(row["availability"], 1, 100.0),
             _shown(row["position_rmse_m"]),
             _shown(row["position_rmse_after_10s_m"]),
             _shown(row["norm_full_rms"]),

@@ -1,4 +1,8 @@
-"""What a run's files hold, put against the truth: one track per agent."""
+"""What a run's files hold, put against the truth: one track per agent.
+
+Every tick counts. One without an estimate in time counts with the last estimate before it, which is what its
+user had; ticks before the first estimate have none, and count in the availability alone.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +29,30 @@ NO_STATISTICS = np.nan
 
 
 @dataclass(frozen=True, slots=True)
+class ServedTicks:
+    """What an agent's user had at each of the E ticks of a run that were after its first estimate.
+
+    ``time_s`` ``(E,)`` since the start of the truth; ``own_error_m`` ``(E, 3)`` and ``full_error`` ``(E, 6n)`` of the
+    newest estimate of that tick or before; ``available`` ``(E,)``: whether it was the tick's own, in time.
+    ``expected_s`` of all ticks, those before the first estimate too.
+    """
+
+    expected_s: Floats
+    time_s: Floats
+    own_error_m: Floats
+    full_error: Floats
+    available: Flags
+
+    def availability(self, from_s: float = 0.0) -> float | None:
+        """Share of the ticks from a time on that had an estimate in time; ``None`` if there was no tick."""
+        expected = np.count_nonzero(self.expected_s >= from_s - ROUNDING_S)
+        in_time = np.count_nonzero(self.available & (self.time_s >= from_s - ROUNDING_S))
+        return in_time / expected if expected else None
+
+
+@dataclass(frozen=True, slots=True)
 class AgentTrack:
-    """One agent's estimates at K ticks, those without an estimate (status "no data") left out of the errors.
+    """One agent's estimates at K ticks, those of nothing (status "no data") among them, and what it ``served``.
 
     ``time_s`` ``(K,)`` since the start of the truth, ``own_m`` and ``own_sigma_m`` ``(K, 3)`` NED position and
     1-sigma, ``own_error_m`` ``(K, 3)``, ``full_error`` ``(K, 6n)`` (zero for drones that were no part of the
@@ -50,6 +76,7 @@ class AgentTrack:
     tick_time_s: Floats
     on_time: Flags
     known: Flags
+    served: ServedTicks
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,10 +115,13 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     known = np.asarray(entries["status"] != Status.NO_DATA)
     covariance_diagonal = np.array([covariance_of(entry, len(config.ids)).diagonal()[own] for entry in entries])
     latency_s = entries["published_s"] - entries["t_s"] - period_s
+    on_time = np.asarray(latency_s <= period_s + ROUNDING_S)
     first_tick = int(np.ceil((start_s - ROUNDING_S) / period_s))
+    ticks_expected = max(int(np.floor((end_s + ROUNDING_S) / period_s)) - first_tick, 0)
+    ticks = first_tick + np.arange(ticks_expected)
     return AgentTrack(
         agent_id=agent_id,
-        ticks_expected=max(int(np.floor((end_s + ROUNDING_S) / period_s)) - first_tick, 0),
+        ticks_expected=ticks_expected,
         records=len(paths),
         time_s=entries["t_s"] - start_s,
         own_m=entries["mean"][:, own],
@@ -101,9 +131,26 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
         nees=np.array([_nees(entries[k], error[k]) if known[k] else NO_STATISTICS for k in range(len(entries))]),
         latency_s=latency_s,
         tick_time_s=entries["tick_time_s"],
-        on_time=np.asarray(latency_s <= period_s + ROUNDING_S),
+        on_time=on_time,
         known=known,
+        served=_served(config, truth, own, entries[known & on_time], ticks),
     )
+
+
+def _served(
+    config: FleetConfig, truth: Truth, own: slice, estimates: NDArray[np.void], ticks: NDArray[np.int64]
+) -> ServedTicks:
+    """The newest estimate at each tick; ``estimates`` are those that were there in time, in order of their ticks."""
+    period_s, start_s = config.fleet.period_s, float(truth.time_unix_s[0]) - config.fleet.epoch_unix_s
+    own_ticks = np.round(estimates["t_s"] / period_s).astype(np.int64)
+    newest = np.searchsorted(own_ticks, ticks, side="right") - 1
+    time_s = np.asarray(ticks * period_s - start_s, np.float64)
+    begun = newest >= 0
+    newest, of_tick = newest[begun], ticks[begun]
+    when = np.clip(config.fleet.epoch_unix_s + of_tick * period_s, truth.time_unix_s[0], truth.time_unix_s[-1])
+    error = estimates["mean"][newest] - truth.at(when).reshape(len(newest), STATES_PER_AGENT * len(config.ids))
+    error[np.repeat(is_absent(estimates["age_ticks"][newest]), STATES_PER_AGENT, axis=1)] = 0.0
+    return ServedTicks(time_s, time_s[begun], error[:, own], error, own_ticks[newest] == of_tick)
 
 
 def _nees(entry: np.void, error: Floats) -> float:

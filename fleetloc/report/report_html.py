@@ -28,6 +28,7 @@ th:first-child, td:first-child { text-align: left; } tr.total td { font-weight: 
 
 COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("ticks on time", lambda row: f"{row['ticks_on_time']} of {row['ticks_expected']}"),
+    ("available %", lambda row: _number(row["availability"], 1, 100)),
     ("position RMSE m", lambda row: _number(row["position_rmse_m"], 3)),
     ("after 10 s", lambda row: _number(row["position_rmse_after_10s_m"], 3)),
     ("fleet error rms", lambda row: _number(row["norm_full_rms"], 3)),

@@ -32,23 +32,24 @@ SIGMA_M = 0.5
 AGENTS = (1, 2, 3)
 
 
-def make_run(directory: Path) -> Any:
-    """Three drones at rest; each knows itself to be off by half a metre, with 0.5 m of sigma per state.
+def make_run(directory: Path, north_mps: float = 0.0) -> Any:
+    """Three drones; each knows itself to be off by half a metre, with 0.5 m of sigma per state.
 
-    Agent 1 has no estimate in its first 10 ticks, 20 late ticks and a restart without ticks for a second;
-    agent 3 left no record at all.
+    They are at rest, or fly north. Agent 1 has no estimate in its first 10 ticks, 20 late ticks and a restart
+    without ticks for a second; agent 3 left no record at all.
     """
     config = load_config(LINE3)
     header = {"fleet": "line3", "agents": AGENTS, "period_s": PERIOD_S, "epoch_unix_s": config.fleet.epoch_unix_s}
     start_s = config.fleet.epoch_unix_s + FIRST_TICK * PERIOD_S
     times = start_s + np.arange(0.0, SECONDS + 0.01, 0.02)
-    places = np.broadcast_to(np.arange(9.0).reshape(3, 3), (len(times), 3, 3))
-    Truth(times, AGENTS, places.copy(), np.zeros((len(times), 3, 3)), np.zeros((0, 2), int), np.zeros(0)).save(
+    places = np.broadcast_to(np.arange(9.0).reshape(3, 3), (len(times), 3, 3)).copy()
+    places[:, :, 0] += north_mps * (times - start_s)[:, None]
+    Truth(times, AGENTS, places, np.zeros((len(times), 3, 3)), np.zeros((0, 2), int), np.zeros(0)).save(
         directory / run_files.TRUTH
     )
-    mean = np.zeros(18)
+    at_start = np.zeros(18)
     for slot in range(3):
-        mean[6 * slot : 6 * slot + 3] = np.arange(9.0).reshape(3, 3)[slot] + OFFSET_M
+        at_start[6 * slot : 6 * slot + 3] = np.arange(9.0).reshape(3, 3)[slot] + OFFSET_M
     lives = {1: [range(100), range(110, TICKS + 5)], 2: [range(-3, TICKS + 5)]}
     for agent_id, parts in lives.items():
         for part in parts:
@@ -57,6 +58,8 @@ def make_run(directory: Path) -> Any:
             recorder = EstimateLogWriter(path, EstimateLogHeader(agent=agent_id, **header), 10**8)
             for k in part:
                 tick = FIRST_TICK + k
+                mean = at_start.copy()
+                mean[[0, 6, 12]] += north_mps * k * PERIOD_S
                 blind = agent_id == 1 and k < 10
                 status = Status.NO_DATA if blind else Status.OK
                 estimate = Estimate(
@@ -87,7 +90,11 @@ def test_ticks_are_counted_against_what_the_flight_demands(figures: dict[str, An
     restarted, well, absent = figures["agents"]
     assert [agent["ticks_expected"] for agent in figures["agents"]] == [TICKS] * 3
     assert restarted["ticks_on_time"] == TICKS - 20 - 10
-    assert restarted["ticks_without_estimate"] == 10
+    assert restarted["ticks_without_estimate"] == 10 + 10
+    assert restarted["availability"] == pytest.approx((TICKS - 40) / TICKS)
+    assert restarted["availability_after_10s"] == pytest.approx(0.9)
+    assert (well["availability"], absent["availability"]) == (1.0, 0.0)
+    assert figures["fleet"]["availability"] == pytest.approx((2 * TICKS - 40) / (3 * TICKS))
     assert restarted["daemons"] == 2
     assert well["ticks_on_time"] == TICKS
     assert (absent["ticks_on_time"], absent["daemons"], absent["position_rmse_m"]) == (0, 0, None)
@@ -103,6 +110,17 @@ def test_errors_are_those_of_the_truth_at_the_tick(figures: dict[str, Any]) -> N
         assert agent["tick_time_p50_s"] == pytest.approx(0.002)
     assert figures["fleet"]["position_rmse_m"] == pytest.approx(0.5)
     assert figures["fleet"]["times_real_time"] == pytest.approx(SECONDS / 21.0)
+
+
+def test_a_tick_without_an_estimate_in_time_counts_with_the_last_one_before_it(tmp_path: Path) -> None:
+    # GIVEN drones that fly north at 1 m/s, WHEN estimates are late for 20 ticks and missing for 10
+    config = make_run(tmp_path, north_mps=1.0)
+    restarted, well, _ = report_figures(config, load_results(config, tmp_path), tmp_path, outcome(), "live")["agents"]
+    # THEN what was had in the meantime falls behind by 0.1 m a tick
+    behind_m = PERIOD_S * np.array([*range(1, 21), *range(1, 11), *[0] * (TICKS - 40)])
+    squares = (OFFSET_M[0] - behind_m) ** 2 + OFFSET_M[1] ** 2 + OFFSET_M[2] ** 2
+    assert restarted["position_rmse_m"] == pytest.approx(np.sqrt(squares.mean()))
+    assert well["position_rmse_m"] == pytest.approx(0.5)
 
 
 def test_counters_of_all_lives_are_added(figures: dict[str, Any]) -> None:

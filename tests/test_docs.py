@@ -17,7 +17,9 @@ import yaml
 from agent.config.documents import merged
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig, SensorsTable
+from agent.errors import ConfigError
 from agent.exit_codes import ExitCode
+from agent.sensing.clock import require_epoch
 from agent.uwb.adapter import UwbAdapter
 from agent.watch.health import assess
 from estimators.integrity.finding import Finding, Gravity, What
@@ -299,3 +301,50 @@ def test_the_functions_of_each_walk_are_in_their_files(walk: str) -> None:
 def test_there_are_five_walks() -> None:
     assert len(walks()) == 5
     assert all(len(rows) > 8 for rows in walks().values())
+
+
+# --- refused configurations -----------------------------------------------------------------------------------
+
+MISTAKES = {
+    "a misspelt key": {"estimator": {"windw": 3}},
+    "a former key": {"mavlink": {"rate_floor": 0.5}},
+    "a key that is missing": {"agents": [{"id": 1}]},
+    "one address twice": {"agents": [{"id": i, "mavlink": "udpin:127.0.0.1:14551"} for i in (1, 2)]},
+    "a slow serial line": {"agents": [{"id": 1, "mavlink": "serial:/dev/ttyS1:57600"}]},
+    "no address on the radio": {
+        "agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:14551", "listen": ["tcp/127.0.0.1:7447"]}],
+        "transport": {"link": "udp"},
+    },
+    "shares beyond the period": {"transport": {"rounds_fraction": 0.9}},
+    "a guard beyond the exchange": {"transport": {"guard_s": 0.5}},
+    "an epoch of the future": {"fleet": {"epoch_unix_s": 5e9}},
+    "an estimator that no drone can have": {"estimator": {"kind": "centralized_ekf"}},
+    "no port": {"agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:14551", "listen": ["tcp/127.0.0.1:99999"]}]},
+}
+TOLD_ELSEWHERE = ("`--out:", "`security: keys", "`warning: ...`")
+"""Rows of other causes than a mistake in the file."""
+
+
+def refusal(mistake: dict[str, Any]) -> str:
+    """What a configuration with a mistake is refused with."""
+    tables = merged(stub(), {})
+    tables["agents"] = mistake.get("agents", tables["agents"])
+    try:
+        config = config_from(merged(tables, {k: v for k, v in mistake.items() if k != "agents"}), "fleet.toml")
+    except ConfigError as error:
+        return str(error)
+    with pytest.raises(ConfigError) as refused:
+        require_epoch(config, unix_s=1.8e9)
+    return str(refused.value)
+
+
+def test_the_refusals_that_are_explained_are_those_that_are_given() -> None:
+    """GIVEN each row on refused configurations WHEN that mistake is made THEN its words are those of the row."""
+    section = troubleshooting().partition("## A configuration is refused")[2].partition("\n## ")[0]
+    rows = re.findall(r"^\| (`[^`]+`).*? \|", section, re.MULTILINE)
+    given = [refusal(mistake) for mistake in MISTAKES.values()]
+    for row in rows:
+        if not row.startswith(TOLD_ELSEWHERE):
+            words = re.sub(r"\\\.\\\.\\\.|\b[A-Z]+\b", ".*", re.escape(row.strip("`")))
+            assert any(re.search(words, line) for line in given), (row, given)
+    assert len(rows) - len(TOLD_ELSEWHERE) == len(MISTAKES)

@@ -84,7 +84,7 @@ def first_configuration() -> str:
 
 
 def give_files(folder: Path) -> None:
-    """What a reader has: the example configurations, a fleet's file, logs of flights, ranges, a recording."""
+    """What a reader has: the example configurations, a fleet's file, logs of flights, ranges, a study input."""
     shutil.copytree(ROOT / "configs", folder / "configs")
     (folder / "fleet.toml").write_text(first_configuration(), encoding="utf-8")
     for name in ("uav1.tlog", "uav2.tlog", "uav3.tlog", "flight.tlog"):

@@ -290,9 +290,8 @@ class AgentCore:
         return self.records.lacked(self._tick, self.neighbours.heard(now_s))
 
     def _exchange_by_s(self) -> float:
-        """When the exchange under way ends at the latest."""
-        share = (self._exchange + 1) / self._config.transport.exchanges
-        return self._close_s + share * (self._packets_by_s - self._close_s)
+        """When the exchange under way ends at the latest: each may take half of the time that is left."""
+        return self._packets_by_s - (self._packets_by_s - self._close_s) * 0.5 ** (self._exchange + 1)
 
     def _packets_due_s(self) -> float:
         """When there is something to do while packets are waited for."""

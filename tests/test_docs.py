@@ -29,6 +29,9 @@ from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
 from tests.support.doc_pages import DOCS, FENCE, PAGES, ROOT, Block, blocks, written_commands
 from transport.errors import Reason
+from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
+from transport.messages.information_body import content_bytes
+from transport.messages.measurement_body import RECORD_BYTES, MeasurementKind
 
 SITE = ROOT / "mkdocs.yml"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -348,3 +351,30 @@ def test_the_refusals_that_are_explained_are_those_that_are_given() -> None:
             words = re.sub(r"\\\.\\\.\\\.|\b[A-Z]+\b", ".*", re.escape(row.strip("`")))
             assert any(re.search(words, line) for line in given), (row, given)
     assert len(rows) - len(TOLD_ELSEWHERE) == len(MISTAKES)
+
+
+# --- the wire -------------------------------------------------------------------------------------------------
+
+
+def budget(row: str) -> list[int]:
+    """The numbers for three, five and ten drones in the first row of the budget that begins so."""
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8").partition("**The budget.**")[2]
+    line = next(line for line in page.splitlines() if line.startswith(f"| {row}"))
+    return [int(re.findall(r"\d+", cell)[0]) for cell in line.split("|")[2:5]]
+
+
+def test_the_budget_of_the_wire_is_that_of_the_codecs() -> None:
+    """GIVEN the sizes of measurements on the wire WHEN a tick is added up THEN the page says so."""
+    sizes = RECORD_BYTES
+    fix = sizes[MeasurementKind.POSITION] + sizes[MeasurementKind.VELOCITY] + sizes[MeasurementKind.ACCELERATION]
+    own = [fix + (n - 1) * sizes[MeasurementKind.RANGE] for n in (3, 5, 10)]
+    assert budget("own measurements of a tick") == own
+    assert budget("first and second exchange") == [n * s for n, s in zip((3, 5, 10), own, strict=True)]
+    assert budget("own ticks in one packet") == [MAX_DATAGRAM_BODY_BYTES // s for s in own]
+    page = (DOCS / "architecture.md").read_text(encoding="utf-8")
+    told = re.findall(
+        r"position (\d+), velocity (\d+), speed (\d+), range (\d+), anchor range (\d+), accel\w+ (\d+)", page
+    )
+    assert [int(size) for size in told[0]] == [sizes[kind] for kind in MeasurementKind]
+    pairs = [content_bytes(n, double=False) for n in (3, 5, 10)]
+    assert "{}, {}, {} for 3, 5, 10 agents in float32".format(*pairs) in page

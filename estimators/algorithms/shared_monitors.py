@@ -32,7 +32,7 @@ from estimators.model.measurements import Matrix, RowTable, empty_rows
 from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import POSITION, any_of
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 
 RESEATED_SPREAD = 2.0
 """Factor on the covariance of a place that the own data hold to: the window's rows are in it already."""

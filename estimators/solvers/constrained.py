@@ -26,8 +26,8 @@ from estimators.solvers.constrained_kernels import (
     prepare,
 )
 from estimators.solvers.qp import QpEngine, QuadraticProgram, make_engine, solve_exactly
-from estimators.window.problem import Window
-from estimators.window.types import (
+from estimators.window.least_squares import Window
+from estimators.window.problem import (
     CORRECTED,
     NOTHING,
     PREDICTED,

@@ -14,7 +14,7 @@ from estimators.model.motion import predict_sensitivity
 from estimators.model.row_kernels import chain_gradient
 from estimators.solvers.gauss_newton import minimise, set_weights
 from estimators.window.kernels import arrival_update, write_states
-from estimators.window.problem import (
+from estimators.window.least_squares import (
     WINDOW,
     Trajectory,
     Window,
@@ -23,8 +23,8 @@ from estimators.window.problem import (
     hessian,
     roll_out,
 )
+from estimators.window.problem import CORRECTED, OPTIONS, PROBLEM, StepOptions, WindowProblem
 from estimators.window.regional import REGION, Region, gather, regional_problem
-from estimators.window.types import CORRECTED, OPTIONS, PROBLEM, StepOptions, WindowProblem
 
 
 class PreparedWindow(NamedTuple):

@@ -8,7 +8,7 @@ from estimators.compiled.entries import kernel
 from estimators.compiled.linear_algebra import cholesky_solve, factor_upper
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.row_kernels import PRECISION
-from estimators.window.problem import (
+from estimators.window.least_squares import (
     Trajectory,
     Window,
     correction_hessian,
@@ -48,7 +48,7 @@ def set_weights(window: Window, path: Trajectory) -> None:
 
 @kernel
 def _fill_hessian(window: Window, path: Trajectory, exact: bool, h: Matrix) -> None:
-    """Upper triangle of h <- Gauss-Newton or exact Hessian, see `estimators.window.problem.hessian`."""
+    """Upper triangle of h <- Gauss-Newton or exact Hessian, see `estimators.window.least_squares.hessian`."""
     if window.gains.shape[0] == 0 and window.noise_precision.shape[0] > 0:
         correction_hessian(window, path, exact, h)
     else:

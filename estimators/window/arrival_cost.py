@@ -18,7 +18,7 @@ from estimators.model.measurements import ROW, Matrix, RowTable
 from estimators.model.members import InformationState
 from estimators.window.history import MeasurementWindow
 from estimators.window.marginalization import Filtering, filter_reweighted
-from estimators.window.types import WindowProblem, WindowSolution
+from estimators.window.problem import WindowProblem, WindowSolution
 
 
 def smoothed_arrival(problem: WindowProblem, solution: WindowSolution, *, slide: bool) -> InformationState:

@@ -8,7 +8,7 @@ from estimators.model.gaussian import Pair
 from estimators.model.layout import Layout
 from estimators.settings import EstimatorSettings, fade_per_tick
 from estimators.window.history import MeasurementWindow
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 
 
 def open_window(settings: EstimatorSettings, layout: Layout, period_s: float) -> MeasurementWindow:

@@ -26,10 +26,9 @@ from estimators.model.row_kernels import (
     encode_rows,
 )
 from estimators.solvers.gauss_newton import minimise
+from estimators.window.least_squares import Trajectory, Window
 from estimators.window.pre_estimation import pre_estimate
-from estimators.window.problem import Trajectory, Window
-from estimators.window.regional import Region, regional_problem, scatter
-from estimators.window.types import (
+from estimators.window.problem import (
     CORRECTED,
     NOTHING,
     OPTIONS,
@@ -37,6 +36,7 @@ from estimators.window.types import (
     StepOptions,
     WindowProblem,
 )
+from estimators.window.regional import Region, regional_problem, scatter
 
 CONVERGED = 0
 NOT_CONVERGED = 1

@@ -18,7 +18,7 @@ from estimators.model.corrections import add_corrections
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.motion import predict_information, predict_state
 from estimators.model.second_order import linearisation_variance
-from estimators.window.types import PROBLEM, WindowProblem
+from estimators.window.problem import PROBLEM, WindowProblem
 
 SIGNIFICANT = 0.05
 """Share of a row's variance below which what its linearisation misses is left out."""

@@ -17,9 +17,9 @@ from estimators.compiled.linear_algebra import cholesky_solve, factor_upper, inv
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.row_kernels import IntArray, encode_rows
+from estimators.window.least_squares import Window
 from estimators.window.pre_estimation import pre_estimate
-from estimators.window.problem import Window
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 
 
 @kernel

@@ -12,7 +12,7 @@ from estimators.model.motion import predict_mean
 from estimators.settings import EstimatorSettings
 from estimators.solvers.constrained import solve_constrained, step_options
 from estimators.window.kernels import NOT_CONVERGED, UNUSABLE, filter_window, moving_horizon_step
-from estimators.window.types import WindowProblem, WindowSolution
+from estimators.window.problem import WindowProblem, WindowSolution
 
 
 def solve_window(

@@ -25,7 +25,7 @@ from estimators.model.measurements import (
     velocity_rows,
 )
 from estimators.window.history import MeasurementWindow
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 from sim_bridge.studies.study_input import StudyInput
 from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import dense_reference as dense

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.model.measurements import Kind, RowTable
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 
 Array = NDArray[np.float64]
 

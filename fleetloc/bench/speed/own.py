@@ -9,8 +9,8 @@ from estimators.consensus.information import fuse
 from estimators.estimator import Payload
 from estimators.model.measurements import Matrix, Vector
 from estimators.settings import EstimatorSettings
+from estimators.window.problem import WindowSolution
 from estimators.window.solving import pre_estimation, solve_window
-from estimators.window.types import WindowSolution
 from fleetloc.bench.speed.windows import PERIOD_S, BenchWindow
 
 

@@ -1,6 +1,6 @@
 """The same windows for casadi's solvers: IPOPT and sequential quadratic programming with OSQP.
 
-The nonlinear program is that of `estimators.window.problem` over the states of the whole window (multiple
+The nonlinear program is that of `estimators.window.least_squares` over the states of the whole window (multiple
 shooting, the form that suits both solvers best: sparse exact derivatives), with the frozen gains, the prior
 and the measurements as parameters. It is built once for all windows of one structure, so only the solution is
 timed.
@@ -18,7 +18,7 @@ import numpy as np
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, transition_matrix
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 from fleetloc.bench.speed.bounds import Bounds
 from fleetloc.bench.speed.plain_numpy import PlainModel, prior_moments
 from fleetloc.extras import require_extra

@@ -22,7 +22,7 @@ from estimators.estimator import Payload
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, transition_matrix
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 from fleetloc.bench.speed.bounds import Bounds
 from fleetloc.bench.speed.windows import BenchWindow
 

@@ -22,7 +22,7 @@ from estimators.model.motion import predict_mean
 from estimators.model.row_kernels import IntArray
 from estimators.settings import EstimatorSettings
 from estimators.window.history import MeasurementWindow
-from estimators.window.types import WindowProblem
+from estimators.window.problem import WindowProblem
 from fleetloc.errors import InputError
 from sim_bridge.studies.lockstep import neighbours, own_input, own_rows
 from sim_bridge.studies.study_input import StudyInput

@@ -17,8 +17,8 @@ from estimators.model.layout import Layout
 from estimators.model.measurements import Kind, RowTable
 from estimators.settings import EstimatorSettings
 from estimators.settings import Kind as EstimatorKind
+from estimators.window.problem import WindowProblem
 from estimators.window.solving import solve_window
-from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import run_lockstep
 from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support import builders

@@ -19,8 +19,8 @@ from estimators.integrity.observability import observability_rank
 from estimators.model.layout import Layout
 from estimators.settings import EstimatorSettings
 from estimators.window.history import MeasurementWindow
+from estimators.window.problem import WindowProblem
 from estimators.window.solving import pre_estimation, solve_window
-from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import Links, own_input, own_rows, run_lockstep
 from sim_bridge.studies.study_input import StudyInput, recording_from_arrays
 from tests.support import dense_reference as dense

@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from estimators.model.measurements import Kind
 from estimators.settings import EstimatorSettings
 from estimators.settings import Kind as EstimatorKind
+from estimators.window.problem import WindowProblem
 from estimators.window.solving import solve_window
-from estimators.window.types import WindowProblem
 from sim_bridge.studies.lockstep import LockstepResult, run_lockstep
 from sim_bridge.studies.study_input import StudyInput
 from sim_bridge.studies.study_scenario import StudyScenario

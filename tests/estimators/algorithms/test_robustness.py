@@ -20,8 +20,8 @@ from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
 from estimators.settings import EstimatorSettings
 from estimators.settings import Kind as EstimatorKind
 from estimators.window.history import MeasurementWindow
+from estimators.window.problem import WindowProblem
 from estimators.window.solving import pre_estimation, solve_window
-from estimators.window.types import WindowProblem
 from tests.support import builders
 
 Array = NDArray[np.float64]

@@ -20,9 +20,9 @@ from estimators.model.measurements import Kind, empty_rows
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix
 from estimators.solvers.constrained_kernels import BoundPoint, LinearProgram, evaluate, linearise_bounds, prepare
 from estimators.solvers.gauss_newton import set_weights
-from estimators.window.problem import correction_hessian, empty_trajectory, gradient, hessian, roll_out
+from estimators.window.least_squares import correction_hessian, empty_trajectory, gradient, hessian, roll_out
+from estimators.window.problem import CORRECTED, NOTHING, PREDICTED, StepOptions, WindowProblem
 from estimators.window.solving import pre_estimation
-from estimators.window.types import CORRECTED, NOTHING, PREDICTED, StepOptions, WindowProblem
 from tests.support import builders
 from tests.support import dense_reference as dense
 

@@ -15,8 +15,8 @@ from scipy.optimize import lsq_linear
 from estimators.estimator import Status
 from estimators.model.measurements import Kind
 from estimators.settings import EstimatorSettings
+from estimators.window.problem import WindowProblem, WindowSolution
 from estimators.window.solving import solve_window
-from estimators.window.types import WindowProblem, WindowSolution
 from tests.support import builders
 from tests.support import dense_reference as dense
 

@@ -72,7 +72,10 @@ class OnboardAgent:
         """``unix_s`` and ``host_s`` are one instant on the two clocks; ``link_signing`` is of the autopilot's link.
 
         ``linked``: whether there is such a link; without one samples come ready made (`on_sample`), as from a log.
+        Raises ``ValueError`` for a journal without a link.
         """
+        if journal is not None and not linked:
+            raise ValueError("a journal takes down bytes, and there are none without the autopilot's link")
         self.agent_id = agent_id
         self._config = config
         self._make_estimator = make_estimator

@@ -29,7 +29,7 @@ RETIRED: Mapping[str, Retired] = {
     "sensors.gps_speed_sigma_mps": Retired(0.3, "it is 0.3 m/s"),
     "sensors.gps_uere_m": Retired(2.5, "it is 2.5 m"),
     "sensors.uwb_max_age_s": Retired(1.0, "it is 1 s"),
-    "sensors.uwb_max_range_m": Retired(2000.0, "a frame with a range over 2000 m is refused"),
+    "sensors.uwb_max_range_m": Retired(2000.0, "a range over 2000 m is left out"),
     "sensors.attitude_max_age_s": Retired(0.3, "it is 0.3 s"),
     "sensors.accel_gap_sigma_mps2": Retired(1.1547, "it is 1.1547 m/s2, of a uniform in +-2 m/s2"),
     "initial.position_sigma_m": Retired(50.0, "it is 50 m"),

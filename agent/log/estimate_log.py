@@ -76,6 +76,7 @@ class EstimateLogWriter:
             path.parent.mkdir(parents=True, exist_ok=True)
             self._file = path.open("wb")
             self._file.write(msgspec.json.encode(header) + b"\n")
+            self._file.flush()  # whoever reads a log that has just begun finds one without estimates
         except OSError as error:
             raise LogFileError(f"record {path}: cannot be written: {error.strerror}") from error
 

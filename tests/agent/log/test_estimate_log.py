@@ -63,6 +63,16 @@ def test_a_killed_writer_leaves_whole_entries(tmp_path: Path) -> None:
     assert read_entries(path)[1]["tick"].tolist() == [1]
 
 
+def test_a_log_that_has_just_begun_is_read_as_one_without_estimates(tmp_path: Path) -> None:
+    # GIVEN a daemon that has begun and is killed before its first estimate
+    path = tmp_path / "agent_001.estimates"
+    writer = EstimateLogWriter(path, HEADER, 10**6)
+    header, entries = read_entries(path)
+    assert header == HEADER
+    assert len(entries) == 0
+    writer.close()
+
+
 def test_a_full_record_stops_growing_and_says_so(tmp_path: Path) -> None:
     recorder = EstimateLogWriter(tmp_path / "a.estimates", HEADER, 3 * entry_dtype(2).itemsize)
     for tick in range(5):

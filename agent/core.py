@@ -6,9 +6,9 @@ goes in decides what comes out, bit by bit. ``now_s`` is fleet time and never go
 Tick k ends at E = (k+1) T and is worked off in this order:
 
 =============================  =================================================================
-by E + guard                   close the timeline; own records and input; measurement packet out
-by E + exchange                neighbours' packets in; when all are there or their share of the time is
-                               over, the next exchange: a packet out with what the last one brought
+by E + guard                   close the timeline; own measurements and input; a packet of them out
+by E + exchange                neighbours' packets in; when all are there, or half of the time left is
+                               over, the next exchange: a packet out with what the last ones brought
 then                           `Estimator.begin`
 by E + exchange + rounds       L consensus rounds, each until complete or its share is over
 then                           `Estimator.solve`; estimate out
@@ -263,16 +263,12 @@ class AgentCore:
         """
         assert self._tick is not None
         usual = min(USUAL_EXCHANGES, self._config.transport.exchanges)
-        if self._exchange + 1 < usual:
-            if now_s < self._exchange_by_s() and not self.neighbours.all_measured(self._tick, self._exchange, now_s):
-                return False
-            self._tell_records(self._exchange + 1, now_s, outputs)
-        elif self._repairs(now_s) and now_s >= self._exchange_by_s():
-            self._tell_records(self._exchange + 1, now_s, outputs)
-        elif now_s >= self._packets_by_s or (
-            not self._repairs(now_s) and self.neighbours.all_measured(self._tick, usual - 1, now_s)
-        ):
+        wanted = self._exchange + 1 < usual or self._repairs(now_s)
+        complete = self.neighbours.all_measured(self._tick, min(self._exchange, usual - 1), now_s)
+        if now_s >= self._packets_by_s or (complete and not wanted):
             self._begin(now_s, outputs)
+        elif wanted and (now_s >= self._exchange_by_s() or (complete and self._exchange + 1 < usual)):
+            self._tell_records(self._exchange + 1, now_s, outputs)
         else:
             return False
         return True

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Container, Iterable, Sequence
 from dataclasses import dataclass, field
 
@@ -22,6 +22,7 @@ from transport.messages.measurement_body import (
 
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
+ECHOES_REMEMBERED = 64
 AHEAD_TICKS = 2
 """Records of a neighbour whose clock is ahead by more are refused."""
 
@@ -102,6 +103,8 @@ class MeasurementStore:
         """The records taken in, by tick and identity."""
         self._to_send: dict[int, tuple[dict[object, _OnItsWay], dict[object, _OnItsWay]]] = {}
         """Own and relayed records by tick, each by its identity."""
+        self._echoed_after: deque[int] = deque(maxlen=ECHOES_REMEMBERED)
+        """How many ticks after theirs our own records were said back, of late."""
         self._echoes: dict[object, Measurement] = {}
         """What was heard since the last packet, by its identity."""
         self._rows: list[Measurement] = []
@@ -126,14 +129,16 @@ class MeasurementStore:
                 self._echoes[name] = record
                 if self._add(record, name):
                     taken.append(record)
-            self._note_holder(sender, record)
+            self._note_holder(sender, record, tick)
         return taken
 
-    def _note_holder(self, sender: int, record: Measurement) -> None:
+    def _note_holder(self, sender: int, record: Measurement, tick: int) -> None:
         for part in self._to_send.get(record.tick, ()):
             sent = part.get(identity(record))
-            if sent is not None:
+            if sent is not None and sender not in sent.held_by:
                 sent.held_by.add(sender)
+                if record.observer == self._agent_id:
+                    self._echoed_after.append(max(tick - record.tick, 0))
 
     def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
         """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
@@ -186,8 +191,12 @@ class MeasurementStore:
         return Measurements(tick, tuple(lacked.values()), exchange)
 
     def lacked(self, tick: int, neighbours: Collection[int]) -> bool:
-        """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get."""
-        for of_tick in range(tick - 1, tick - self._history_ticks, -1):
+        """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get.
+
+        Where links are slow no echo can be back yet of the last ticks' records: these are not asked for.
+        """
+        newest = tick - 1 - min(self._echoed_after, default=0)
+        for of_tick in range(newest, tick - self._history_ticks, -1):
             for part in self._to_send.get(of_tick, ()):
                 if not all(sent.held_by.issuperset(neighbours) for sent in part.values()):
                     return True

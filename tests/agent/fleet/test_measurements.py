@@ -222,6 +222,20 @@ def test_a_record_is_told_until_every_neighbour_has_said_it(make_config: Callabl
     assert told(store, 8, 1, 3, 4) == [(2, 5), (1, 5)]
 
 
+def test_on_a_slow_link_nothing_is_asked_for_before_its_echo_can_be_back(
+    make_config: Callable[..., FleetConfig],
+) -> None:
+    # GIVEN a link over which our record comes back three ticks later
+    store = MeasurementStore(line(make_config, 2, "estimator.relay_hops=1"), 1)
+    for tick in range(5, 9):
+        store.add_own(position(1, tick))
+    assert store.lacked(9, (2,))
+    store.add_heard(2, [position(1, 5)], 8)
+    # THEN those of the last three ticks are not lacked yet, an older one is
+    assert not store.lacked(9, (2,))
+    assert store.lacked(10, (2,))
+
+
 def test_what_is_heard_is_said_back_once_behind_what_is_lacked(make_config: Callable[..., FleetConfig]) -> None:
     # GIVEN an end of a line, that relays to nobody
     store = MeasurementStore(line(make_config, 3, "estimator.relay_hops=0"), 1)

@@ -44,9 +44,9 @@ class BlindCase:
 
 
 CASES = (
-    BlindCase("K4", "K4", 2.0, 0.14),
-    BlindCase("K5", "K5", 2.0, 0.06),
-    BlindCase("K6", "K6", 2.0, 0.05),
+    BlindCase("K4", "K4", 2.0, 0.06),
+    BlindCase("K5", "K5", 2.0, 0.04),
+    BlindCase("K6", "K6", 2.0, 0.04),
     BlindCase("triangle from 0.3 m", "triangle", 0.3, 0.33),
     BlindCase("triangle", "triangle", 2.0),
     BlindCase("ring4", "ring4", 2.0),

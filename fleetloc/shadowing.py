@@ -43,8 +43,11 @@ def _found(room: str) -> Path | None:
         spec = importlib.util.find_spec(room)
     except ValueError:  # something in sys.modules without a specification
         return Path(getattr(sys.modules[room], "__file__", None) or room)
-    if spec is None or spec.origin is None:  # the latter for folders without __init__.py, which are nobody's package
+    if spec is None:
         return None
+    if spec.origin is None:  # a folder without __init__.py: elsewhere it hides what an editable installation finds
+        folder = Path(next(iter(spec.submodule_search_locations or ()), room)).resolve()
+        return None if folder == OWN / room else folder
     origin = Path(spec.origin).resolve()
     return origin.parent if origin.name == "__init__.py" else origin
 

@@ -18,7 +18,7 @@ from agent.config.reading import load_config
 from fleetloc.report.fleet_report import report_figures
 from fleetloc.report.fleet_results import FleetResults, load_results
 from fleetloc.run.lockstep_run import fly_in_lockstep
-from tests.support.lossnet.delivery import Delivery, delivery
+from tests.support.lossnet.delivery import Delivery, delivery, heard_so_far
 from tests.support.lossnet.flight import LossyFlight, why_not
 from tests.support.machine import Witness, check_on_time, witnessed
 
@@ -29,7 +29,7 @@ ALL_PAIRS = "fleet.edges=[[1,2],[1,3],[2,3]]"
 LOSS, DELAY_S = 0.3, 0.05
 WARM_S, COLD_S = 8.0, 15.0
 """A cold link comes up when all four datagrams of a handshake get through: every fourth try, two tries in 3 s."""
-MEETING_S = 2.0
+PATIENCE_S, POLL_S = 60.0, 0.2
 
 pytestmark = [
     pytest.mark.slow,
@@ -55,6 +55,14 @@ class Flown:
         return float(np.percentile(ages_s - late_s, percent))
 
 
+def wait_until_met(flight: LossyFlight) -> None:
+    """Until every daemon has heard every other one, by their flight logs."""
+    deadline_s = time.monotonic() + PATIENCE_S
+    while not all(heard_so_far(flight.out, one) == set(flight.ids) - {one} for one in flight.ids):
+        assert time.monotonic() < deadline_s, "daemons on a clean segment do not meet"
+        time.sleep(POLL_S)
+
+
 def fly(out: Path, *, cold: bool, duration_s: float) -> Flown:
     """Fly line3, everybody a neighbour of everybody."""
     with LossyFlight(LINE3, out, [ALL_PAIRS], [LOSSY_RADIO]) as flight, witnessed(out) as witness:
@@ -62,7 +70,7 @@ def fly(out: Path, *, cold: bool, duration_s: float) -> Flown:
             flight.set_faults(loss=LOSS, delay_s=DELAY_S)
         flight.start_daemons()
         if not cold:
-            time.sleep(MEETING_S)  # the daemons have nothing to say yet by which it could be seen that they met
+            wait_until_met(flight)
             flight.set_faults(loss=LOSS, delay_s=DELAY_S)
         begin_s = time.time()
         flight.fly(duration_s)

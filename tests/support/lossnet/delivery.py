@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from agent.errors import LogFileError
 from agent.inputs import PacketIn
 from agent.log.flight_reader import FlightReader, RecordedInput
 from fleetloc.run import run_files
@@ -78,6 +79,14 @@ def delivery(directory: Path, pairs: list[tuple[int, int]], begin_s: float, end_
     ages_s = [age for found in heard.values() for age in found.ages_s]
     sent_s = [t for found in heard.values() for t in found.sent_s]
     return Delivery(share, ages_s, sent_s, first_s)
+
+
+def heard_so_far(directory: Path, receiver: int) -> set[int]:
+    """Whom a running daemon has heard, by what of its flight log is on the disk."""
+    try:
+        return {header.sender for header, _ in _packets(directory, receiver)}
+    except LogFileError:  # its head is not there yet
+        return set()
 
 
 def _numbers_sent(heard: dict[tuple[int, int], Pair], sender: int) -> set[tuple[PacketKind, int]]:

@@ -18,6 +18,7 @@ from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import read_entries
 from fleetloc.report.fleet_results import load_results
+from fleetloc.run import run_files
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from sim_bridge.world.truth import load_truth
 from tests.support.fleet_process import ROOT, FleetProcess, until
@@ -26,6 +27,7 @@ from tests.support.machine import Witness, check_on_time, witnessed
 pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 Start = Callable[..., FleetProcess]
 DROPPED_WITHIN_S, BACK_WITHIN_S = 2.0, 10.0
+TAKEN_BACK_TICKS = 60
 SETTLED_S = 10.0
 
 
@@ -94,7 +96,7 @@ def check_page(page: str) -> None:
 
 
 def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path: Path) -> None:
-    fleet = start_fleet("--duration", "14")
+    fleet = start_fleet("--duration", "600")
     until(fleet.flying, "flight")
     until(lambda: "agent 2: ok" in fleet.log(2), "agent 2 is aligned")
     with witnessed(tmp_path) as witness:
@@ -106,6 +108,8 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path:
         cwd=ROOT, stderr=subprocess.DEVNULL,
     )  # fmt: skip
     try:
+        until(lambda: entries_of_second_life(fleet.out) >= TAKEN_BACK_TICKS, "the restarted agent estimates")
+        fleet.interrupt()
         code, _, stderr = fleet.finish()
     finally:
         restarted.terminate()
@@ -123,6 +127,12 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path:
     check_ticks_without_gap(fleet.out)
     check_taken_back(fleet.out, killed_at.timestamp())
     assert fleet.nothing_left()
+
+
+def entries_of_second_life(out: Path) -> int:
+    """How many estimates the restarted agent 3 has on the disk."""
+    lives = run_files.records(out, 3)
+    return len(read_entries(lives[-1])[1]) if len(lives) == 2 else 0
 
 
 def time_of(log: str, words: str) -> datetime:

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
-from sim_bridge.replay.range_files import RangeCounts, read_ranges
+from sim_bridge.replay.side_files.range_files import RangeCounts, read_ranges
 
 Floats = NDArray[np.float64]
 NORMAL_OF_MAD = 1.4826

@@ -20,11 +20,11 @@ from sim_bridge.replay.logs.events import LogSource, TruthSample
 from sim_bridge.replay.logs.opening import open_log
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan, make_plan
-from sim_bridge.replay.range_files import UNIX_FROM_S, RangeCounts, RangeLine, read_ranges
 from sim_bridge.replay.reading import surveyed
-from sim_bridge.replay.recorded_ranges import ranges_of_record
+from sim_bridge.replay.side_files.range_files import UNIX_FROM_S, RangeCounts, RangeLine, read_ranges
+from sim_bridge.replay.side_files.recorded_ranges import ranges_of_record
+from sim_bridge.replay.side_files.truth_files import TruthFile
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
-from sim_bridge.replay.truth_files import TruthFile
 from sim_bridge.replay.what_if import GpsDrop, GpsDrops, ReplaySpan
 
 SYNTHETIC = "synthetic"

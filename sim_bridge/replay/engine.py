@@ -17,7 +17,7 @@ from agent.core import EstimatorFactory
 from agent.onboard import OnboardAgent
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
 from sim_bridge.replay.feed import Arrival, Feed, Heard
-from sim_bridge.replay.range_files import RangeLine
+from sim_bridge.replay.side_files.range_files import RangeLine
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.virtual_fleet import OnEstimate, VirtualDrone, VirtualFleet, channel_of
 from transport.messages.uwb_body import UwbFrame, UwbRange

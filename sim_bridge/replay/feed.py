@@ -19,7 +19,7 @@ from typing import Any, Protocol
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
 from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
-from sim_bridge.replay.range_files import RangeCounts, RangeLine
+from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine
 from sim_bridge.replay.synthesis import Synthesiser
 from sim_bridge.replay.what_if import GpsDrops
 

@@ -22,7 +22,7 @@ from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.feed import Arrival, Feed, Tallies
 from sim_bridge.replay.logs.events import LogSource
 from sim_bridge.replay.naming import names_apart
-from sim_bridge.replay.range_files import RangeLine
+from sim_bridge.replay.side_files.range_files import RangeLine
 
 BATCH = 500
 """Arrivals that cross the pipe together; a batch is about as large as the pipe's buffer."""

@@ -15,7 +15,7 @@ import numpy as np
 from agent.sensing.samples import Triple
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.events import TruthSample
-from sim_bridge.replay.range_files import RangeLine
+from sim_bridge.replay.side_files.range_files import RangeLine
 
 MAX_GAP_S = 0.5
 """Between samples of truth further apart nobody knows where a drone was."""

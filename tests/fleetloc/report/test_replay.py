@@ -20,8 +20,8 @@ from fleetloc.report import replay_exports
 from fleetloc.report.range_study import pair_figures
 from fleetloc.run.replay_setup import split_truth
 from sim_bridge import side_process
-from sim_bridge.replay.range_files import RangeCounts
-from sim_bridge.replay.recorded_ranges import ranges_of_record
+from sim_bridge.replay.side_files.range_files import RangeCounts
+from sim_bridge.replay.side_files.recorded_ranges import ranges_of_record
 from tests.support.logs import LOGS
 from tests.support.recorded_fleet import RecordedFleet
 

@@ -31,7 +31,7 @@ from sim_bridge.replay.logs.events import (
     UnixZero,
 )
 from sim_bridge.replay.plan import make_plan
-from sim_bridge.replay.range_files import RangeLine
+from sim_bridge.replay.side_files.range_files import RangeLine
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
 from sim_bridge.replay.what_if import GpsDrop, GpsDrops
 from tests.support.holding import held

@@ -20,9 +20,9 @@ from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.events import Format, LogCounts, LogEvent, LogSurvey, SystemSurvey, UnixZero
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import LEAD_S, make_plan
+from sim_bridge.replay.side_files.truth_files import TruthFile
 from sim_bridge.replay.statistics import Spread, Thinned
 from sim_bridge.replay.tracks import TrackWriter, WrittenTrack
-from sim_bridge.replay.truth_files import TruthFile
 from sim_bridge.replay.what_if import GpsDrop, GpsDrops, ReplaySpan
 
 FRAME = FleetFrame(47.397742, 8.545594, 489.4, True, None)

@@ -32,10 +32,10 @@ from sim_bridge.replay.logs.events import (
     UnixZero,
 )
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
-from sim_bridge.replay.range_files import RangeCounts, RangeLine, read_ranges
 from sim_bridge.replay.reading import BATCH, read_beside, surveyed
+from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine, read_ranges
+from sim_bridge.replay.side_files.truth_files import TruthFile
 from sim_bridge.replay.synthesis import Synthesiser, SyntheticNoise
-from sim_bridge.replay.truth_files import TruthFile
 from sim_bridge.replay.what_if import GpsDrop, GpsDrops
 from tests.support.logs import FRAME, LOGS
 

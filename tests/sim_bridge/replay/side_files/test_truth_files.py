@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from agent.sensing.frames import FleetFrame
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.stamps import LOOK_AHEAD, rising
-from sim_bridge.replay.truth_files import TruthFile
+from sim_bridge.replay.side_files.truth_files import TruthFile
 
 FRAME = FleetFrame(47.397742, 8.545594, 489.4, True, None)
 UNIX_S = 1.8e9

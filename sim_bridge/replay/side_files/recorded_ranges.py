@@ -7,7 +7,7 @@ from pathlib import Path
 
 from agent.inputs import HouseKept, UwbIn
 from agent.log.flight_reader import FlightReader, RecordedInput
-from sim_bridge.replay.range_files import RangeCounts, RangeLine, in_order, ranges_at
+from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine, in_order, ranges_at
 from transport.errors import Rejected
 from transport.messages.uwb_body import decode_uwb
 

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Any
 
 from sim_bridge.replay.errors import ReplayError
-from sim_bridge.replay.text_lines import text_lines
+from sim_bridge.replay.side_files.text_lines import text_lines
 from transport.errors import Rejected
 from transport.messages.uwb_body import MAX_RANGE_M, UwbFrame, decode_uwb
 

@@ -22,7 +22,7 @@ from agent.sensing.samples import Quaternion, Triple
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.events import TruthSample
 from sim_bridge.replay.logs.stamps import rising
-from sim_bridge.replay.text_lines import text_lines
+from sim_bridge.replay.side_files.text_lines import text_lines
 
 POSITION, VELOCITY, QUATERNION = ("n", "e", "d"), ("vn", "ve", "vd"), ("qw", "qx", "qy", "qz")
 UNIX_NAMES, BOOT_NAME = ("unix_s", "time_unix_s"), "time_boot_s"

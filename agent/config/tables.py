@@ -83,8 +83,6 @@ class MavlinkTable(Table, frozen=True):
     """Rate asked of the autopilot for its attitude."""
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
     """Rate asked of the autopilot for fixes."""
-    max_rtt_s: Positive = 0.010
-    """TIMESYNC exchanges slower than this (or twice the best) are not used."""
     appear_timeout_s: NotNegative = 60.0
     """The daemon gives up if no autopilot appears within this; 0 = it waits for ever. One that was there and
     disappears never stops it."""
@@ -148,12 +146,8 @@ class InitialTable(Table, frozen=True):
 
     position_m: Point | None = None
     """NED, for all agents; absent = wait for own fixes (or ranges and records of neighbours)."""
-    speed_sigma_mps: Positive = 3.0
-    """About the velocity that the first fixes show, or about zero."""
     fixes: Annotated[int, msgspec.Meta(ge=1, le=100)] = 5
     """Own GPS fixes before the estimator starts."""
-    max_wait_s: NotNegative = 2.0
-    """Without own fixes: start among the others, own place not observable yet, after this long."""
 
 
 class TransportTable(Table, frozen=True):
@@ -172,8 +166,6 @@ class TransportTable(Table, frozen=True):
     """Longest time that a link may take to be opened before it is tried anew."""
     retry_max_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 2.0
     """Longest pause before a neighbour that does not answer is dialled again; from 0.2 s on they double."""
-    redeclare_after_s: Annotated[float, msgspec.Meta(ge=0.2, le=600)] = 1.0
-    """A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
     guard_s: NotNegative = 0.01
     """A tick is closed this long after its end, when its last samples have come in."""
     exchange_fraction: Fraction = 0.3
@@ -208,8 +200,6 @@ class RecordTable(Table, frozen=True):
     """Whether to write a flight record beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
     flight_max_mb: Positive = 2000.0
     """Of a flight record, both files together; it ends here, the daemon goes on."""
-    min_free_mb: NotNegative = 100.0
-    """A flight record ends when its disk has less left."""
 
 
 class HealthTable(Table, frozen=True):

@@ -18,6 +18,8 @@ TRACK_FIXES = 20
 ENOUGH_FIXES = 10
 POSITION_SIGMA_M = 50.0
 """Of a drone that nothing was heard of yet; own fixes narrow it by themselves."""
+VELOCITY_SIGMA_MPS = 3.0
+"""Per axis about the velocity that the first fixes show, or about zero."""
 SPEED_SIGMA_MPS = 0.15
 """A velocity surer than this needs no more fixes, up to `ENOUGH_FIXES`: a speed is linearised about its direction."""
 VELOCITY_SPREAD = 2.0
@@ -28,7 +30,7 @@ class FixTracks:
     """The last fixes of every drone, own and heard; ``motions`` is fed by its owner."""
 
     def __init__(self, config: FleetConfig, motions: Motions) -> None:
-        self._settings = config.initial
+        self._enough = config.initial.fixes
         self._period_s = config.fleet.period_s
         self._motions = motions
         self._fixes: dict[int, deque[PositionMeasurement]] = {}
@@ -52,7 +54,7 @@ class FixTracks:
         of it by their slope, so that a speed or range is not linearised about a direction that nothing is known of.
         """
         fixes = [fix for fix in self._fixes.get(agent_id, ()) if at_tick - FIX_MEMORY_TICKS <= fix.tick < at_tick]
-        if self._count[agent_id] < self._settings.fixes or len(fixes) < 2:
+        if self._count[agent_id] < self._enough or len(fixes) < 2:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)
         lead_s = np.array([(fix.tick - at_tick) * self._period_s + fix.offset_s for fix in fixes])
@@ -68,23 +70,23 @@ class FixTracks:
         if measured is not None and abs(at_tick - measured.tick) <= FIX_MEMORY_TICKS:
             known = np.asarray(measured.variance_m2ps2) < speed_variance
             mean[3:][known] = np.asarray(measured.velocity_mps)[known]
-            covariance[3:, 3:][np.diag(known)] = self._settings.speed_sigma_mps**2  # measured again in the window
+            covariance[3:, 3:][np.diag(known)] = VELOCITY_SIGMA_MPS**2  # measured again in the window
         return mean, covariance
 
     def prior(self, position_m: Vector | Triple, velocity_mps: Vector) -> Prior:
         """A wide prior about a place, NED m and m/s: what is known is left to the measurements to say."""
-        sigma = [POSITION_SIGMA_M] * 3 + [self._settings.speed_sigma_mps] * 3
+        sigma = [POSITION_SIGMA_M] * 3 + [VELOCITY_SIGMA_MPS] * 3
         return np.concatenate((position_m, velocity_mps)), np.diag(np.square(sigma))
 
     def _line(self, lead_s: Vector, places: Matrix, variance: Matrix) -> tuple[Vector, Vector, Vector]:
         """Position and velocity ``(3,)`` at the reference of the lines that fit best, and the velocity's variance.
 
-        The velocity has the configured prior about zero.
+        The velocity has a wide prior about zero.
         """
         weights = 1.0 / variance
         total = weights.sum(axis=0)
         middle_s, middle = (weights * lead_s[:, None]).sum(axis=0) / total, (weights * places).sum(axis=0) / total
         apart = lead_s[:, None] - middle_s
-        information = (weights * apart**2).sum(axis=0) / VELOCITY_SPREAD + self._settings.speed_sigma_mps**-2.0
+        information = (weights * apart**2).sum(axis=0) / VELOCITY_SPREAD + VELOCITY_SIGMA_MPS**-2.0
         slope = (weights * apart * (places - middle)).sum(axis=0) / VELOCITY_SPREAD / information
         return middle - middle_s * slope, slope, 1.0 / information

@@ -12,6 +12,7 @@ from collections import deque
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.fix_tracks import VELOCITY_SIGMA_MPS
 from agent.fleet.motions import MEMORY_TICKS, Motions
 from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
@@ -36,7 +37,6 @@ class RangeLocator:
 
     def __init__(self, config: FleetConfig, motions: Motions) -> None:
         self._period_s = config.fleet.period_s
-        self._speed_sigma_mps = config.initial.speed_sigma_mps
         self._ranges: deque[RangeMeasurement] = deque(maxlen=4096)
         self._motions = motions
         self._known: dict[int, _Known] = {}
@@ -94,7 +94,7 @@ class RangeLocator:
             shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
             variances.append(record.variance_m2 + shared + wandered[back])
         ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
-        return multilaterate(ranges, self._speed_sigma_mps)
+        return multilaterate(ranges, VELOCITY_SIGMA_MPS)
 
 
 def _other_end(record: RangeMeasurement, agent_id: int) -> int | None:

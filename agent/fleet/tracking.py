@@ -14,7 +14,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from agent.config.tables import FleetConfig
-from agent.fleet.fix_tracks import POSITION_SIGMA_M
+from agent.fleet.fix_tracks import POSITION_SIGMA_M, VELOCITY_SIGMA_MPS
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
 from estimators.consensus.mapping import mapped_payload
@@ -34,6 +34,8 @@ EstimatorFactory = Callable[[EstimatorSettings, Layout, int, Vector, Matrix, flo
 ESTIMATOR_FAULTS = (ArithmeticError, ValueError)
 """What broken numerics raise (numpy's LinAlgError is a ValueError): the estimator starts anew, nothing stops."""
 MAX_MEAN = 1e6
+MAX_WAIT_S = 2.0
+"""Without own fixes an agent starts among the others after this long, its own place not observable yet."""
 RESTART_VARIANCE = 1.0
 """What a start from the last good estimate adds to its covariance, in m2 and (m/s)2."""
 ABSENT_VARIANCE = 1e8
@@ -204,19 +206,18 @@ class FleetTracker:
         if self._since_s is None:
             self._since_s = now_s
         if initial.position_m is not None:
-            sigma = [POSITION_SIGMA_M] * 3 + [initial.speed_sigma_mps] * 3
+            sigma = [POSITION_SIGMA_M] * 3 + [VELOCITY_SIGMA_MPS] * 3
             mean = np.array([*initial.position_m, 0.0, 0.0, 0.0])
             return {agent: (mean, np.diag(np.square(sigma))) for agent in self._config.ids}
         found = self.roll.newcomers(tick, tick)
-        waited = now_s - self._since_s >= initial.max_wait_s
+        waited = now_s - self._since_s >= MAX_WAIT_S
         return found if self._agent_id in found or waited else {}
 
     def _unlocated(self, others: Mapping[int, Prior]) -> Prior:
         """The own block while nothing says where it is: amid the others, as wide as can be."""
-        speed_sigma_mps = self._config.initial.speed_sigma_mps
         mean = np.mean([prior[0] for prior in others.values()], axis=0)
         mean[3:] = 0.0
-        variance = [(2.0 * POSITION_SIGMA_M) ** 2] * 3 + [speed_sigma_mps**2] * 3
+        variance = [(2.0 * POSITION_SIGMA_M) ** 2] * 3 + [VELOCITY_SIGMA_MPS**2] * 3
         return mean, np.diag(variance)
 
     def _change(self, tick: int) -> None:

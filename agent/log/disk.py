@@ -6,6 +6,9 @@ import shutil
 from collections.abc import Callable
 from pathlib import Path
 
+MIN_FREE_BYTES = 100_000_000
+"""What a record or a log leaves of the disk to the rest of the drone."""
+
 
 def free_bytes(directory: Path) -> int:
     """What the disk of a folder has left for us; raises `OSError`."""
@@ -19,7 +22,11 @@ class DiskLimit:
     """
 
     def __init__(
-        self, directory: Path, max_bytes: int, min_free_bytes: int, free: Callable[[Path], int] = free_bytes
+        self,
+        directory: Path,
+        max_bytes: int,
+        min_free_bytes: int = MIN_FREE_BYTES,
+        free: Callable[[Path], int] = free_bytes,
     ) -> None:
         self._directory = directory
         self._max_bytes = max_bytes
@@ -32,5 +39,5 @@ class DiskLimit:
             return f"it has the {self._max_bytes / 1e6:g} MB of record.flight_max_mb"
         free = self._free(self._directory)
         if free < self._min_free_bytes:
-            return f"the disk has {free / 1e6:.0f} MB left, record.min_free_mb is {self._min_free_bytes / 1e6:g}"
+            return f"the disk has {free / 1e6:.0f} MB left, and {self._min_free_bytes / 1e6:g} MB stay free"
         return ""

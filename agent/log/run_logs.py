@@ -45,7 +45,7 @@ class RunLogs(Observer):
         self._estimates = EstimateLogWriter(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
         self.flight: FlightLog | None = None
         if settings.flight:
-            limit = DiskLimit(directory, int(settings.flight_max_mb * MB), int(settings.min_free_mb * MB))
+            limit = DiskLimit(directory, int(settings.flight_max_mb * MB))
             self.flight = FlightLog(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
 
     def counters(self) -> dict[str, int]:

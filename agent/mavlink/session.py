@@ -78,7 +78,7 @@ class AutopilotSession:
         self._fleet_clock = clock
         self.decoder = Decoder(datagrams=datagrams, signing=signing)
         self._encoder = Encoder(self._expected_system, config.mavlink.component_id, signing)
-        self.clock = BootClock(config.mavlink.max_rtt_s)
+        self.clock = BootClock()
         self.samples = SampleAdapter(
             FleetFrame.of(config), config.sensors, config.fleet.epoch_unix_s, self._fleet_time_of_boot
         )

@@ -12,6 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 
 WINDOW_S = 10.0
+MAX_RTT_S = 0.010
+"""A slower exchange is not used, unless none is much faster: one over a slow radio is as good as its best."""
 FAST_PERIOD_S, SLOW_PERIOD_S = 0.1, 1.0
 FAST_FOR_S = 10.0
 MAX_PENDING = 32
@@ -34,8 +36,7 @@ class Exchange:
 class BootClock:
     """Converts boot time to host time, both in seconds."""
 
-    def __init__(self, max_rtt_s: float = 0.010) -> None:
-        self._max_rtt_s = max_rtt_s
+    def __init__(self) -> None:
         self.rejected = 0
         """Replies not asked for, too slow or out of line."""
         self.reset()
@@ -71,7 +72,7 @@ class BootClock:
         sent_s = (ts1_ns // 1000) * 1e-6
         rtt_s = now_s - sent_s
         best = min((e.rtt_s for e in self._exchanges), default=rtt_s)
-        if not 0 <= rtt_s <= max(self._max_rtt_s, 2 * best):
+        if not 0 <= rtt_s <= max(MAX_RTT_S, 2 * best):
             self.rejected += 1
             return
         boot_s = tc1_ns * 1e-9

@@ -26,6 +26,8 @@ from transport.security.sealing import Packet
 
 LOG = logging.getLogger("fleetloc.agent")
 USED_STREAMS = (Stream.MEAS, Stream.INFO)
+REDECLARE_AFTER_S = 1.0
+"""A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
 
 OnPacket = Callable[[str, bytes, float, int], None]
 """(key expression, packet, arrival on the monotonic clock in s, UTC in ns that it is to be judged by)."""
@@ -188,7 +190,7 @@ class Radio:
         )
 
     def _repair_later(self) -> None:
-        after_s = self._config.transport.redeclare_after_s
+        after_s = REDECLARE_AFTER_S
         self._repair = asyncio.get_running_loop().call_later(after_s, self._redeclare)
 
     def _redeclare(self) -> None:
@@ -197,7 +199,7 @@ class Radio:
         Zenoh tells a neighbour once per link, and a datagram that is lost is not repeated: it would send us nothing
         as long as the link lives.
         """
-        latest_s = time.monotonic() - self._config.transport.redeclare_after_s
+        latest_s = time.monotonic() - REDECLARE_AFTER_S
         for neighbour, heard_s in self._heard_s.items():
             if self._session is not None and heard_s < latest_s:
                 self._session.resubscribe(neighbour)

@@ -48,19 +48,11 @@ class FaultsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_on
     """``[transport.faults]``: more that can be injected than ``loss`` and ``delay_s``, on every link alike."""
 
     burst_start: Probability = 0.0
-    """Gilbert-Elliott: probability per packet that a burst of losses begins."""
+    """Gilbert-Elliott: probability per packet that a burst begins, in which all packets are lost."""
     burst_end: Annotated[float, msgspec.Meta(gt=0, le=1)] = 0.25
     """Gilbert-Elliott: probability per packet that it ends; bursts are 1/burst_end packets long on average."""
-    burst_loss: Probability = 1.0
-    """Loss within a burst."""
-    delay_uniform_s: Seconds = 0.0
-    """Width of a delay on top that is uniform from zero."""
-    in_order: bool = False
-    """Whether a packet waits for those before it, as on a stream; else random delays reorder."""
     reorder: Probability = 0.0
-    """Probability that a packet is held back and overtaken."""
-    reorder_delay_s: Seconds = 0.02
-    """For how long."""
+    """Probability that a packet is held back by 20 ms and overtaken."""
     duplicate: Probability = 0.0
     """Probability that a packet comes twice, the copy with a delay of its own."""
     outages: tuple[RadioOutage, ...] = ()
@@ -92,13 +84,9 @@ def channel_settings(
         loss=loss,
         burst_start=faults.burst_start,
         burst_end=faults.burst_end,
-        burst_loss=faults.burst_loss,
         delay_s=delay_s,
         delay_exponential_s=delay_jitter_s,
-        delay_uniform_s=faults.delay_uniform_s,
-        in_order=faults.in_order,
         reorder=faults.reorder,
-        reorder_delay_s=faults.reorder_delay_s,
         duplicate=faults.duplicate,
         outages=tuple(outages),
     )

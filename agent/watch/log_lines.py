@@ -10,15 +10,13 @@ from pathlib import Path
 
 from agent.config.observer_tables import LogTable
 from agent.errors import LogFileError
-from agent.log.disk import free_bytes
+from agent.log.disk import MIN_FREE_BYTES, free_bytes
 
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
 LINE = "%(asctime)s %(levelname)s %(message)s"
 DISK_CHECK_PERIOD_S = 1.0
 KEEP = 5
 """Files put aside that are kept."""
-MIN_FREE_BYTES = 100_000_000
-"""With less left on the disk, files put aside are deleted, the oldest first, and then no more is written."""
 MAX_BYTES = 10_000_000
 """A file that has grown to this is put aside as ``.1``, what was ``.1`` as ``.2``."""
 

@@ -44,7 +44,7 @@ class SitlSession:
         self._encoder = Encoder(self._system, COMPONENT_ID)
         self.decoder = Decoder(datagrams=datagrams)
         self.tap = TruthTap(FleetFrame.of(config))
-        self.clock = BootClock(config.mavlink.max_rtt_s)
+        self.clock = BootClock()
         self.rates: StreamRates | None = None
         self.flavour: str | None = None
         """``px4`` or ``ardupilot`` once it is found."""

@@ -27,13 +27,10 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         epoch_unix_s=config.fleet.epoch_unix_s,
         edges=config.fleet.edges,
         gravity_mps2=gravity_mps2(config),
-        imu_hz=sim.imu_hz,
-        attitude_hz=sim.attitude_hz,
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,
         uwb_staggered=sim.profile == "realistic",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
-        max_accel_mps2=sim.max_accel_mps2,
         gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
     )
 

@@ -82,16 +82,10 @@ class SimTable(Table, frozen=True):
     """Noise: the paper's uniform one, or what real sensors look like."""
     duration_s: Positive = 60.0
     """Length of the flight."""
-    imu_hz: Annotated[float, msgspec.Meta(ge=10, le=1000)] = 100.0
-    """Rate of the simulated IMU."""
-    attitude_hz: Annotated[float, msgspec.Meta(ge=1, le=400)] = 50.0
-    """Rate of the simulated attitude."""
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
     """Rate of the simulated receiver."""
     uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
     """Rate at which every pair ranges."""
-    max_accel_mps2: Positive = 2.0
-    """Commanded acceleration is clipped to this per axis."""
     gps_outages: tuple[GpsOutage, ...] = ()
     """When which receivers see nothing."""
     paths: tuple[PathTable, ...] = ()

@@ -17,6 +17,7 @@ from tests.support.fleet_process import LINE3, ROOT, FleetProcess, on_free_ports
 from tests.support.ports import HOST, bound
 
 Start = Callable[..., FleetProcess]
+STEEP = 'sim.paths=[{agent=1, kind="circle", center_m=[0.0, 0.0, -5.0], radius_m=50.0, lap_s=10.0}]'
 
 
 def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, str]:
@@ -33,7 +34,8 @@ def refused(capsys: pytest.CaptureFixture[str], *arguments: str) -> tuple[int, s
     [
         ("estimator.windo=3", "estimator.windo: expected one of kind, window"),
         ("fleet.period_s=0", "fleet.period_s"),
-        ("sim.imu_hz=900", "imu_hz: expected more than 0 and at most 200, found 900"),
+        ("sim.gps_hz=900", "sim.gps_hz: expected a number <= 50, found 900"),
+        (STEEP, "agent 1: path: expected one that needs at most 2.0 m/s2 per axis"),
         ("transport.loss=2", "transport.loss"),
     ],
 )

@@ -165,8 +165,7 @@ def test_groups_that_are_left_out_are_everybody() -> None:
 
 
 def test_all_faults_reach_the_channel_with_those_of_the_caller() -> None:
-    table = {"burst_start": 0.1, "burst_end": 0.5, "burst_loss": 0.9, "delay_uniform_s": 0.01, "in_order": True,
-             "reorder": 0.2, "reorder_delay_s": 0.03, "duplicate": 0.04}  # fmt: skip
+    table = {"burst_start": 0.1, "burst_end": 0.5, "reorder": 0.2, "duplicate": 0.04}
     document = read_document(LINE3).tables
     document["transport"]["faults"] = table
     faults = config_from(document, "test").transport.faults

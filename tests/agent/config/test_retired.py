@@ -21,8 +21,11 @@ def with_former_keys(**other: object) -> str:
     """The effective configuration of a fleet as it was once written: with all former keys."""
     tables = tomllib.loads(dump(load_config(LINE3)))
     for key, retired in RETIRED.items():
-        table, _, name = key.partition(".")
-        tables.setdefault(table, {})[name] = other.get(name, retired.value)
+        *path, name = key.split(".")
+        inside = tables
+        for step in path:
+            inside = inside.setdefault(step, {})
+        inside[name] = other.get(name, retired.value)
     lines = []
     for name, table in tables.items():
         for entry in table if isinstance(table, list) else (table,):

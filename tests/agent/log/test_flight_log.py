@@ -296,7 +296,7 @@ def test_a_disk_nearly_full_ends_the_record(
 ) -> None:
     left = iter([ROOM] * 20 + [500] * 100)
     record = make_record(tmp_path, config, free=lambda _: next(left))
-    written, inputs = expect_early_end(record, caplog, "record.min_free_mb", whole=True)
+    written, inputs = expect_early_end(record, caplog, "MB stay free", whole=True)
     assert inputs == written[: 20 * 7]
 
 

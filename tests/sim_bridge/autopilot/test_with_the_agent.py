@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -24,7 +25,7 @@ BOTH = pytest.mark.parametrize("flavour", ["px4", "ardupilot"])
 class Run:
     """One agent's session and its simulated drone, joined by a link that takes 2 ms each way."""
 
-    def __init__(self, flavour: str, **sim: Any) -> None:
+    def __init__(self, flavour: str, attitude_hz: float = 50.0, **sim: Any) -> None:
         config = config_from(
             {
                 "fleet": {
@@ -34,13 +35,14 @@ class Run:
                 },
                 "agents": [{"id": 1, "mavlink": "udpin:127.0.0.1:14551", "autopilot": flavour}],
                 "sensors": {"gps_speed": "norm", "imu_latency_s": 0.0},
-                "mavlink": {"attitude_hz": sim.get("attitude_hz", 50.0)},
+                "mavlink": {"attitude_hz": attitude_hz},
                 "sim": sim,
             },
             "test",
         )
         self.gravity = gravity_mps2(config)
-        self.simulation = Simulation(scenario_from_config(config), START_S, EPOCH_S - START_S)
+        scenario = replace(scenario_from_config(config), attitude_hz=attitude_hz)
+        self.simulation = Simulation(scenario, START_S, EPOCH_S - START_S)
         self.session = onboard_of(config, linked=True, fleet_offset_s=-START_S).autopilot
         self.samples: list[Any] = []
         self.states: dict[int, np.ndarray] = {}

@@ -232,8 +232,9 @@ async def test_the_whole_simulator_publishes_ranges_and_leaves_the_truth(tmp_pat
 
 
 async def test_a_scenario_that_cannot_be_flown_ends_before_anything_is_opened():
-    with pytest.raises(ScenarioError, match="imu_hz"):
-        await simulate(fleet_config(imu_hz=999.0))
+    steep = {"agent": 1, "kind": "circle", "center_m": [0.0, 0.0, -5.0], "radius_m": 50.0, "lap_s": 10.0}
+    with pytest.raises(ScenarioError, match="agent 1: path"):
+        await simulate(fleet_config(paths=[steep]))
 
 
 def test_the_drivers_dial_every_agent_and_listen_nowhere():

@@ -139,6 +139,8 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
         return "its own"
     if value == ():
         return "none"
+    if isinstance(value, tuple):
+        return f"`{list(value)}`"
     if isinstance(value, bool):
         return f"`{str(value).lower()}`"
     if isinstance(value, str):

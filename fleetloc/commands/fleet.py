@@ -110,6 +110,7 @@ def _prepared(
     folder = (out or Path("out") / fleet.fleet.name).resolve()
     run_files.refuse_inputs(folder, (config, *profiles))
     if live:
+        _refuse_liars(config, fleet)
         require_epoch(fleet, unix_s=time.time())
         for agent_id in fleet.ids:
             require(fleet, agent_id, config.parent, unix_s=time.time())
@@ -117,6 +118,19 @@ def _prepared(
     run_files.clear(folder)
     (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
     return fleet
+
+
+def _refuse_liars(path: Path, fleet: FleetConfig) -> None:
+    """Faults of members are injected into agents in virtual time; a daemon has no such hook."""
+    from fleetloc.errors import InputError
+    from sim_bridge.faults.fault_tables import MemberFault
+    from sim_bridge.world.sim_table import sim_table
+
+    lying = [fault for fault in sim_table(fleet).faults if isinstance(fault, MemberFault)]
+    if lying:
+        kind = lying[0].__struct_config__.tag
+        expected = "faults of sensors in a live run (--lockstep flies all)"
+        raise InputError(str(path), "sim.faults", expected, f'"{kind}"')
 
 
 def _fly(config: FleetConfig, folder: Path) -> RunOutcome:

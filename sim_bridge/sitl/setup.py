@@ -8,7 +8,9 @@ from agent.config.endpoints import SPELLINGS, Endpoint, LinkKind, parse_endpoint
 from agent.config.faults import Fault
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError, EndpointError
+from sim_bridge.faults.fault_tables import UwbWrong
 from sim_bridge.sitl.sitl_table import sitl_table
+from sim_bridge.world.sim_table import sim_table
 
 ARDUPILOT_TCP, ARDUPILOT_STEP = 5760, 10
 """Serial port 0 of ArduPilot's SITL listens here; each further instance ten ports higher."""
@@ -40,6 +42,7 @@ class VehicleLinks:
 def vehicle_links(config: FleetConfig) -> dict[int, VehicleLinks]:
     """All links by agent; raises `ConfigError` for addresses that are missing, double or of the wrong kind."""
     _check_height(config)
+    _check_faults(config)
     links = {agent_id: _links(config, agent_id, number) for number, agent_id in enumerate(config.ids)}
     taken: dict[str, str] = {}
     for index, link in enumerate(links.values()):
@@ -70,6 +73,14 @@ def _check_height(config: FleetConfig) -> None:
     if config.fleet.origin.altitude == "ellipsoid" and config.sensors.geoid_separation_m is None:
         expected = "a geoid separation, since the origin's height is ellipsoidal and the simulators' truth is not"
         raise _error(config, "sensors.geoid_separation_m", expected, "none")
+
+
+def _check_faults(config: FleetConfig) -> None:
+    """Only the ranges are simulated here; the other sensors are the simulators' own."""
+    for index, fault in enumerate(sim_table(config).faults):
+        if not isinstance(fault, UwbWrong):
+            expected = "uwb_wrong with real firmware (fixes are left out by sim.gps_outages)"
+            raise _error(config, f"sim.faults[{index}].kind", expected, f'"{fault.__struct_config__.tag}"')
 
 
 def _links(config: FleetConfig, agent_id: int, number: int) -> VehicleLinks:

@@ -23,6 +23,7 @@ from agent.inputs import Journal
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.onboard import OnboardAgent
 from agent.sensing.frames import FleetFrame
+from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.fleet_events import FleetEvents
 from sim_bridge.virtual.virtual_fleet import OnEstimate, VirtualDrone, VirtualFleet, channel_of
@@ -165,6 +166,8 @@ class FleetLockstep:
             journal=self._around.journals.get(agent_id),
             linked=self._feed is None,
         )
+        start_unix_s = self._start_s + self._unix_offset_s
+        corrupt(agent, self._config, identity, self._simulation.scenario.faults, start_unix_s)
         outages = self._around.events.outages(agent_id, self._config.ids, self._start_s)
         channel = channel_of(self._config, agent_id, outages=outages, began_s=self._start_s)
         return VirtualDrone(agent, channel)

@@ -1,4 +1,4 @@
-"""How wrong the simulated sensors are: the paper's uniform noise, and what real sensors look like."""
+"""How wrong the simulated sensors are: the paper's uniform noise, and two pictures of real sensors."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 
 from sim_bridge.world.quaternions import Array
 
-ProfileName = Literal["paper", "realistic"]
+ProfileName = Literal["paper", "realistic", "nom"]
 FlavourName = Literal["px4", "ardupilot"]
 
 
@@ -25,16 +25,22 @@ class ImuNoise:
     held_uniform_mps2: float = 0.0
     accel_sigma_mps2: float = 0.0
     accel_bias_sigma_mps2: float = 0.0
+    accel_walk_mps2: float = 0.0
+    """How far a bias walks in a second, 1-sigma; in t seconds sqrt(t) times as far."""
     gyro_sigma_rps: float = 0.0
     gyro_bias_sigma_rps: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)
 class AttitudeNoise:
-    """Slow error of the autopilot's attitude, first-order Gauss-Markov per axis in the body frame."""
+    """Slow error of the autopilot's attitude, first-order Gauss-Markov per axis in the body frame.
+
+    ``heading_offset_rad`` stays all flight long, to one side or the other, each vehicle's drawn.
+    """
 
     tilt_sigma_rad: float = 0.0
     heading_sigma_rad: float = 0.0
+    heading_offset_rad: float = 0.0
     correlation_s: float = 30.0
 
 
@@ -42,7 +48,8 @@ class AttitudeNoise:
 class GpsNoise:
     """A receiver.
 
-    White noise is per fix; the wander is first-order Gauss-Markov (multipath, ionosphere). ``delivery_s``
+    White noise is per fix; the wander is first-order Gauss-Markov (multipath, ionosphere), ``wander_common`` of its
+    variance the same for all receivers of the fleet. ``delivery_s``
     passes between the stamp of a fix and its message, and the position is ``stamp_lag_s`` older than the
     stamp says. The accuracies and dilutions are what the receiver reports.
     """
@@ -55,6 +62,7 @@ class GpsNoise:
     horizontal_wander_m: float = 0.0
     vertical_wander_m: float = 0.0
     wander_correlation_s: float = 60.0
+    wander_common: float = 0.0
     delivery_s: float = 0.0
     stamp_lag_s: float = 0.0
     h_acc_m: float = 1.0
@@ -142,7 +150,37 @@ REALISTIC = NoiseProfile(
 )
 """Recorded flights and public UWB data: biased pairs, a tail without line of sight, late wandering GPS."""
 
-PROFILES: dict[ProfileName, NoiseProfile] = {"paper": PAPER, "realistic": REALISTIC}
+_NOM_IMU = ImuNoise(
+    accel_sigma_mps2=0.16,
+    accel_bias_sigma_mps2=0.1,
+    accel_walk_mps2=0.01,
+    gyro_sigma_rps=0.003,
+    gyro_bias_sigma_rps=0.001,
+)
+
+NOM = NoiseProfile(
+    imu={"px4": _NOM_IMU, "ardupilot": _NOM_IMU},
+    attitude=AttitudeNoise(
+        tilt_sigma_rad=math.radians(1.0), heading_offset_rad=math.radians(2.0), correlation_s=40.0
+    ),
+    gps=GpsNoise(
+        horizontal_sigma_m=0.15,
+        vertical_sigma_m=0.225,
+        velocity_sigma_mps=0.1,
+        horizontal_wander_m=1.0,
+        vertical_wander_m=1.5,
+        wander_correlation_s=60.0,
+        wander_common=0.5,
+        delivery_s=0.05,
+        h_acc_m=0.4,
+        v_acc_m=0.6,
+        speed_acc_mps=0.2,
+    ),
+    uwb=UwbNoise(sigma_m=0.1, bias_mean_m=0.35, bias_uniform_m=0.15, nlos_probability=0.03, nlos_max_m=math.inf),
+)
+"""The usual errors of sensors that nobody has calibrated, and that claim to be good: they do not average out."""
+
+PROFILES: dict[ProfileName, NoiseProfile] = {"paper": PAPER, "realistic": REALISTIC, "nom": NOM}
 
 
 def uncalibrated(noise: UwbNoise) -> UwbNoise:

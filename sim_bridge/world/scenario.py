@@ -9,6 +9,7 @@ from typing import Literal
 
 from agent.sensing.frames import FleetFrame, normal_gravity_mps2
 from sim_bridge.autopilot.link_faults import LinkQuality
+from sim_bridge.faults.fault_tables import FaultTable, about
 from sim_bridge.world.guidance import Path, Point, peak_accel_mps2
 from sim_bridge.world.noise import FlavourName, ProfileName
 from sim_bridge.world.world import STEP_RATE_HZ
@@ -54,15 +55,6 @@ class Interval:
 
 
 @dataclass(frozen=True, slots=True)
-class GpsJump:
-    """From ``at_s`` on a receiver's positions are off by ``offset_m`` NED."""
-
-    agent: int
-    at_s: float
-    offset_m: Point
-
-
-@dataclass(frozen=True, slots=True)
 class Reboot:
     """An autopilot restarts: silent for ``down_s``, then its boot clock begins at zero."""
 
@@ -101,7 +93,8 @@ class Scenario:
     """Starts are drawn from a cube of this half width about the begin of the path."""
     start_speed_half_width_mps: float = 2.0
     gps_outages: tuple[Interval, ...] = ()
-    gps_jumps: tuple[GpsJump, ...] = ()
+    faults: tuple[FaultTable, ...] = ()
+    """Injected ones; those of members are left to who flies the agents."""
     reboots: tuple[Reboot, ...] = ()
     silences: tuple[Interval, ...] = ()
     """An autopilot's link is dead."""
@@ -137,7 +130,7 @@ class Scenario:
                 )
         self._check_known("edges", (agent for edge in self.edges or () for agent in edge))
         self._check_known("gps_outages", (outage.agent for outage in self.gps_outages))
-        self._check_known("gps_jumps", (jump.agent for jump in self.gps_jumps))
+        self._check_known("faults", (agent for fault in self.faults for agent in about(fault)))
         self._check_known("reboots", (reboot.agent for reboot in self.reboots))
         self._check_known("silences", (silence.agent for silence in self.silences))
 

@@ -29,9 +29,10 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         gravity_mps2=gravity_mps2(config),
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,
-        uwb_staggered=sim.profile == "realistic",
+        uwb_staggered=sim.profile != "paper",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
         gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
+        faults=sim.faults,
     )
 
 

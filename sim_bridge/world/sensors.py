@@ -7,12 +7,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from sim_bridge.faults.sensor_faults import NO_ERROR, RangeError, SensorFaults
 from sim_bridge.world import geodesy, quaternions
-from sim_bridge.world.noise import PROFILES, GaussMarkov, GpsNoise, ImuNoise, UwbNoise, uncalibrated
+from sim_bridge.world.noise import PROFILES, AttitudeNoise, GaussMarkov, GpsNoise, ImuNoise, UwbNoise, uncalibrated
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.world import FleetWorld
@@ -112,9 +113,14 @@ class _Imu:
         self._noise, self._rng = noise, rng
         self._accel_bias = noise.accel_bias_sigma_mps2 * rng.standard_normal(3)
         self._gyro_bias = noise.gyro_bias_sigma_rps * rng.standard_normal(3)
+        self._walked_s = 0.0
 
-    def accel(self, true: Array) -> Array:
-        white = self._noise.accel_sigma_mps2
+    def accel(self, true: Array, time_s: float) -> Array:
+        white, walk = self._noise.accel_sigma_mps2, self._noise.accel_walk_mps2
+        if walk > 0.0 and time_s > self._walked_s:
+            step = walk * math.sqrt(time_s - self._walked_s)
+            self._accel_bias = self._accel_bias + step * self._rng.standard_normal(3)
+            self._walked_s = time_s
         if white == 0.0:
             return true + self._accel_bias
         return np.asarray(true + self._accel_bias + white * self._rng.standard_normal(3))
@@ -124,6 +130,19 @@ class _Imu:
         if white == 0.0:
             return true + self._gyro_bias
         return np.asarray(true + self._gyro_bias + white * self._rng.standard_normal(3))
+
+
+class _AttitudeError:
+    """How wrong one autopilot's attitude is."""
+
+    def __init__(self, noise: AttitudeNoise, slow: np.random.Generator, fixed: np.random.Generator) -> None:
+        tilt, heading = noise.tilt_sigma_rad, noise.heading_sigma_rad
+        self._slow = GaussMarkov(np.array((tilt, tilt, heading)), noise.correlation_s, slow)
+        self._fixed = np.array((0.0, 0.0, noise.heading_offset_rad * (1.0 if fixed.random() < 0.5 else -1.0)))
+
+    def at(self, time_s: float) -> Array:
+        """Rotation vector ``(3,)`` in the body frame."""
+        return np.asarray(self._slow.at(time_s) + self._fixed)
 
 
 class _HeldNoise:
@@ -145,10 +164,9 @@ class _HeldNoise:
 class _Receiver:
     """One GPS receiver: fixes on its own grid, late and wandering by its noise."""
 
-    def __init__(self, noise: GpsNoise, speed: str, rng: np.random.Generator) -> None:
+    def __init__(self, noise: GpsNoise, speed: str, rng: np.random.Generator, common: GaussMarkov) -> None:
         self._noise, self._speed, self._rng = noise, speed, rng
-        wander = np.array((noise.horizontal_wander_m, noise.horizontal_wander_m, noise.vertical_wander_m))
-        self._wander = GaussMarkov(wander, noise.wander_correlation_s, rng)
+        self._wander, self._common = _wander(noise, 1.0 - noise.wander_common, rng), common
 
     def solve(self, time_s: float, position: Array, velocity: Array, accel: Array) -> tuple[Array, Array]:
         """Position and velocity ``(3,)`` NED as the receiver has them."""
@@ -159,7 +177,8 @@ class _Receiver:
         sigma = np.array((noise.horizontal_sigma_m, noise.horizontal_sigma_m, noise.vertical_sigma_m))
         white = sigma * rng.standard_normal(3)
         speed_noise = noise.velocity_sigma_mps * rng.standard_normal(3)
-        return seen + uniform + white + self._wander.at(time_s), velocity - lag_s * accel + speed_noise
+        wander = self._wander.at(time_s) + self._common.at(time_s)
+        return seen + uniform + white + wander, velocity - lag_s * accel + speed_noise
 
     def speed_and_course(self, velocity: Array) -> tuple[float, float]:
         """The two numbers that GPS_RAW_INT has; the speed's uniform noise is along the course."""
@@ -169,6 +188,12 @@ class _Receiver:
         speed += self._noise.speed_uniform_mps * float(self._rng.uniform(-1.0, 1.0))
         course = math.atan2(east, north) + (math.pi if speed < 0.0 else 0.0)
         return abs(speed), course % (2.0 * math.pi)
+
+
+def _wander(noise: GpsNoise, share: float, rng: np.random.Generator) -> GaussMarkov:
+    """A part of the wander of receivers, by its share of the variance."""
+    axes = np.array((noise.horizontal_wander_m, noise.horizontal_wander_m, noise.vertical_wander_m))
+    return GaussMarkov(math.sqrt(share) * axes, noise.wander_correlation_s, rng)
 
 
 class _Channel:
@@ -188,7 +213,9 @@ class _Channel:
         }
         self._phase_rad = {agent: float(rng.uniform(0.0, 2.0 * math.pi)) for agent in ids}
 
-    def measure(self, observer: int, target: int, true_m: float, bearing_rad: float) -> SensedRange:
+    def measure(
+        self, observer: int, target: int, true_m: float, bearing_rad: float, fault: RangeError = NO_ERROR
+    ) -> SensedRange:
         """A range over the true distance; ``bearing_rad`` of the target in the observer's body frame."""
         noise, rng = self._noise, self._rngs[observer]
         uniform = noise.uniform_m * float(rng.uniform(-1.0, 1.0))
@@ -197,7 +224,8 @@ class _Channel:
         detour = min(float(rng.exponential(noise.nlos_mean_m)), noise.nlos_max_m)
         lobe = noise.orientation_m * math.sin(bearing_rad + self._phase_rad[observer])
         bias = self.bias_m[frozenset((observer, target))]
-        error = uniform + white + bias + lobe + (detour if blocked else 0.0)
+        error = uniform + white + bias + lobe + (detour if blocked else 0.0) + fault.extra_m
+        blocked = blocked or fault.blocked
         rx_dbm = -60.0 - 20.0 * math.log10(max(true_m, 1.0)) - (6.0 if blocked else 0.0)
         first_path_dbm = rx_dbm - float(rng.uniform(7.0, 14.0) if blocked else rng.uniform(1.0, 4.0))
         nlos = float(rng.uniform(0.5, 1.0) if blocked else rng.uniform(0.0, 0.3))
@@ -233,17 +261,19 @@ class FleetSensors:
         self._scenario, self._world, self._start_fleet_s = scenario, world, start_fleet_s
         profile = PROFILES[scenario.profile]
         count = len(scenario.ids)
-        kinds = np.random.SeedSequence((scenario.seed, 1)).spawn(5)
-        imu, held, attitude, gps = ([np.random.default_rng(seed) for seed in kind.spawn(count)] for kind in kinds[:4])
+        kinds = np.random.SeedSequence((scenario.seed, 1)).spawn(7)
+        imu, held, attitude, gps, _, heading = (
+            [np.random.default_rng(seed) for seed in kind.spawn(count)] for kind in kinds[:6]
+        )
         imu_noise = [profile.imu[vehicle.flavour] for vehicle in scenario.vehicles]
         self._imu = [_Imu(noise, rng) for noise, rng in zip(imu_noise, imu, strict=True)]
         self._held = _HeldNoise(np.array([noise.held_uniform_mps2 for noise in imu_noise]), held)
-        tilt, heading = profile.attitude.tilt_sigma_rad, profile.attitude.heading_sigma_rad
         self._attitude_error = [
-            GaussMarkov(np.array((tilt, tilt, heading)), profile.attitude.correlation_s, rng) for rng in attitude
+            _AttitudeError(profile.attitude, *rngs) for rngs in zip(attitude, heading, strict=True)
         ]
         self._gps_noise = profile.gps
-        self._receivers = [_Receiver(profile.gps, scenario.gps_speed, rng) for rng in gps]
+        common = _wander(profile.gps, profile.gps.wander_common, np.random.default_rng(kinds[6]))
+        self._receivers = [_Receiver(profile.gps, scenario.gps_speed, rng, common) for rng in gps]
         self._gps_grid = _Grid(scenario.gps_hz)
         self._undelivered: deque[tuple[float, int, GpsFix]] = deque()
         uwb = profile.uwb if scenario.uwb_calibrated else uncalibrated(profile.uwb)
@@ -252,6 +282,7 @@ class FleetSensors:
         self._uwb_grids = [
             _Grid(scenario.uwb_hz, cycle_s * slot / count if scenario.uwb_staggered else 0.0) for slot in range(count)
         ]
+        self._faults = SensorFaults(scenario.faults, scenario.seed)
         self._body_step = -1
         self._body_force = np.zeros((count, 3))
         self._body_rates = np.zeros((count, 3))
@@ -281,9 +312,11 @@ class FleetSensors:
         self._to_body()
         frame = self._scenario.frame
         alt_msl_m = geodesy.msl_m(frame, frame.alt_m - float(self._world.position_m[slot, 2]))
+        time_s = self._world.time_s
+        force = self._imu[slot].accel(self._body_force[slot], time_s)
         return SensedImu(
-            self._world.time_s,
-            self._imu[slot].accel(self._body_force[slot]),
+            time_s,
+            self._faults.force(self._scenario.ids[slot], time_s, force),
             self._imu[slot].gyro(self._body_rates[slot]),
             self._body_field[slot],
             pressure_hpa(alt_msl_m),
@@ -319,12 +352,11 @@ class FleetSensors:
         solved = [
             receiver.solve(world.time_s, *state) for receiver, state in zip(self._receivers, states, strict=True)
         ]
-        positions = np.array([position for position, _ in solved])
-        for jump in scenario.gps_jumps:
-            if world.time_s >= jump.at_s:
-                positions[scenario.slot(jump.agent)] += jump.offset_m
+        errors = [self._faults.gps_error(agent, world.time_s) for agent in scenario.ids]
+        both = list(zip(solved, errors, strict=True))
+        positions = np.array([position + off_m for (position, _), (off_m, _) in both])
+        velocities = [velocity + off_mps for (_, velocity), (_, off_mps) in both]
         places = geodesy.geodetic(scenario.frame, positions)
-        velocities = [velocity for _, velocity in solved]
         return [self._fix(slot, *entry) for slot, entry in enumerate(zip(positions, velocities, places, strict=True))]
 
     def _fix(self, slot: int, position: Array, velocity: Array, place: Array) -> GpsFix:
@@ -332,10 +364,11 @@ class FleetSensors:
         # drawn in an outage too, so that one does not change the noise after it
         speed_mps, course_rad = self._receivers[slot].speed_and_course(velocity)
         agent = scenario.ids[slot]
-        if any(outage.agent == agent and outage.holds(time_s) for outage in scenario.gps_outages):
+        out = any(outage.agent == agent and outage.holds(time_s) for outage in scenario.gps_outages)
+        if out or self._faults.gps_off(agent, time_s):
             return GpsFix(time_s, valid=False)
         lat_deg, lon_deg, height_m = place.tolist()
-        return GpsFix(
+        fix = GpsFix(
             time_s,
             valid=True,
             lat_deg=lat_deg,
@@ -352,6 +385,7 @@ class FleetSensors:
             hdop=noise.hdop,
             vdop=noise.vdop,
         )
+        return replace(self._faults.repeated(agent, time_s, fix), time_s=time_s)
 
     def ranges(self) -> list[SensedRanges]:
         """The ranges taken at this step, a set per observer whose turn it is."""
@@ -373,5 +407,6 @@ class FleetSensors:
             distance_m = math.sqrt(north * north + east * east + down * down)
             if distance_m <= self._scenario.uwb_reach_m:
                 bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
-                measured.append(self._channel.measure(observer, target, distance_m, bearing_rad))
+                fault = self._faults.range_error(observer, target, self._world.time_s)
+                measured.append(self._channel.measure(observer, target, distance_m, bearing_rad, fault))
         return measured

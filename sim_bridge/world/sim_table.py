@@ -12,6 +12,7 @@ from agent.config.faults import Fault
 from agent.config.fields import AgentId, NotNegative, Point, Positive, Seed, Table
 from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
+from sim_bridge.faults.fault_tables import FaultTable, wrong_settings
 
 
 class GpsOutage(Table, frozen=True):
@@ -78,8 +79,8 @@ class SimTable(Table, frozen=True):
 
     seed: Seed = 1
     """Of starts and noise."""
-    profile: Literal["paper", "realistic"] = "paper"
-    """Noise: the paper's uniform one, or what real sensors look like."""
+    profile: Literal["paper", "realistic", "nom"] = "paper"
+    """Noise: the paper's uniform one, what calibrated real sensors look like, or what the usual ones do."""
     duration_s: Positive = 60.0
     """Length of the flight."""
     gps_hz: Annotated[float, msgspec.Meta(ge=0.2, le=50)] = 10.0
@@ -88,6 +89,8 @@ class SimTable(Table, frozen=True):
     """Rate at which every pair ranges."""
     gps_outages: tuple[GpsOutage, ...] = ()
     """When which receivers see nothing."""
+    faults: tuple[FaultTable, ...] = ()
+    """What goes wrong with which drones when."""
     paths: tuple[PathTable, ...] = ()
     """One per agent."""
 
@@ -98,6 +101,7 @@ def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
         yield from unknown_ids(config, f"{key}.agent", (outage.agent,))
         if outage.to_s <= outage.from_s:
             yield Fault(f"{key}.to_s", f"later than from_s = {outage.from_s:g}", f"{outage.to_s:g}")
+    yield from wrong_settings(table.faults, config, "sim.faults")
     flown: set[int] = set()
     for index, path in enumerate(table.paths):
         key = f"sim.paths[{index}].agent"

@@ -59,7 +59,7 @@ def test_mistakes_of_all_tables_are_told_with_their_lines(tmp_path: Path, capsys
     assert [line for line in lines if not line.startswith("warning: ")] == [
         f"{start}:{lines_of['period_s']}: fleet.period_s: expected a number <= 10, found 20.0",
         next(line for line in lines if line.startswith(f"{start}:{lines_of['uwb_bond_m']}: sensors.uwb_bond_m: ")),
-        f"{start}:{lines_of['profile']}: sim.profile: expected one of paper, realistic, found 'papper'; "
+        f"{start}:{lines_of['profile']}: sim.profile: expected one of paper, realistic, nom, found 'papper'; "
         "did you mean paper?",
         next(line for line in lines if "sim.paths of agent 1, lap_s: expected a number > 0, found -1.0" in line),
         f"{start}:{lines_of['vehicles']}: sitl.vehicles of agent 9, agent: expected ids of agents (1, 2, 3), found 9",

@@ -89,6 +89,17 @@ def test_a_run_does_not_overwrite_what_is_laid_over_it(tmp_path: Path, capsys: p
     assert profile.exists()
 
 
+def test_a_live_fleet_refuses_faults_that_only_virtual_time_can_inject(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    lie = 'sim.faults=[{kind="member_stuck", agents=[2]}]'
+    assert cli.main(["fleet", str(LINE3), "--set", lie, "--out", str(tmp_path / "run")]) == 2
+    stderr = capsys.readouterr().err
+    assert "sim.faults: expected faults of sensors in a live run" in stderr
+    assert '"member_stuck"' in stderr
+    assert not (tmp_path / "run").exists()
+
+
 def test_the_folders_of_keys_and_state_are_found_from_anywhere(tmp_path: Path) -> None:
     config = load_config(LINE3, ["security.keys=mine", "security.state=run/state"])
     written = in_folder(config, tmp_path, tmp_path / "out")

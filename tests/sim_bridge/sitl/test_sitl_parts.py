@@ -249,6 +249,7 @@ def test_default_addresses_are_those_of_the_simulators() -> None:
             },
             "geoid separation",
         ),
+        ({"sim": {"faults": [{"kind": "gps_off", "agents": [1]}]}}, "sim.faults, entry 1, kind: expected uwb_wrong"),
     ],
 )
 def test_addresses_that_cannot_work_are_named(tables: dict[str, Any], words: str) -> None:

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from agent.sensing.frames import FleetFrame
+from sim_bridge.faults.fault_tables import GpsWrong
 from sim_bridge.world import quaternions
 from sim_bridge.world.guidance import Waypoints
 from sim_bridge.world.noise import PAPER, REALISTIC, GaussMarkov
-from sim_bridge.world.scenario import GpsJump, Interval, Vehicle
+from sim_bridge.world.scenario import Interval, Vehicle
 from sim_bridge.world.simulation import Simulation
 
 THREE = tuple(Vehicle(agent, "px4", agent) for agent in (1, 2, 3))
@@ -83,9 +84,8 @@ def test_both_heights_are_sent_and_differ_by_the_geoid(make_scenario):
 
 
 def test_outages_and_jumps_hit_one_agent_only(make_scenario):
-    scenario = make_scenario(
-        *THREE, gps_outages=(Interval(2, 1.0, 2.0),), gps_jumps=(GpsJump(3, 3.0, (8.0, 0.0, 0.0)),)
-    )
+    jump = GpsWrong(agents=(3,), from_s=3.0, offset_m=(8.0, 0.0, 0.0))
+    scenario = make_scenario(*THREE, gps_outages=(Interval(2, 1.0, 2.0),), faults=(jump,))
     simulation = Simulation(scenario, 0.0)
     invalid, jumped = [], []
     for world in each_step(simulation, 4.0):

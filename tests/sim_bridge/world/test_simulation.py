@@ -11,8 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from agent.config.reading import config_from, load_config
+from sim_bridge.faults.fault_tables import GpsOff
 from sim_bridge.world.guidance import Circle, FigureEight, Waypoints
-from sim_bridge.world.scenario import GpsJump, Interval, Reboot, ScenarioError, Vehicle
+from sim_bridge.world.scenario import Interval, Reboot, ScenarioError, Vehicle
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.simulation import Simulation, aligned_start
 from sim_bridge.world.uwb_frames import UwbDrivers
@@ -104,7 +105,7 @@ def test_ranges_reach_an_agents_intake(make_scenario):
     [
         ({"edges": ((1, 9),)}, r"edges: expected one of the agents \[1, 2, 3\], found 9"),
         ({"gps_outages": (Interval(5, 0, 1),)}, "gps_outages"),
-        ({"gps_jumps": (GpsJump(5, 0, (0, 0, 0)),)}, "gps_jumps"),
+        ({"faults": (GpsOff(agents=(5,)),)}, "faults"),
         ({"reboots": (Reboot(5, 1.0),)}, "reboots"),
         ({"silences": (Interval(5, 0, 1),)}, "silences"),
         ({"imu_hz": 1000.0}, "imu_hz: expected more than 0 and at most 200"),

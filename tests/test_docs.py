@@ -46,6 +46,18 @@ def prose(page: Path) -> str:
     return re.sub(r"`[^`\n]*`", "", FENCE.sub("", page.read_text(encoding="utf-8")))
 
 
+# --- version ----------------------------------------------------------------------------------------------------
+
+
+def test_the_changelog_begins_with_the_version_that_is_built() -> None:
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    section = re.search(r"^## \[(.+)\] - (.+)$", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE)
+    assert section is not None
+    assert section[1] == version.removesuffix(".dev0")
+    expected = "unreleased" if version.endswith(".dev0") else r"\d{4}-\d\d-\d\d"
+    assert re.fullmatch(expected, section[2])
+
+
 # --- links ----------------------------------------------------------------------------------------------------
 
 

@@ -1,4 +1,4 @@
-"""``fleetloc estimate``: run an estimator over a tick-level recording."""
+"""``fleetloc estimate``: run an estimator over a study input."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ def register(app: typer.Typer) -> None:
 
 
 def estimate(
-    recording: Annotated[Path, typer.Argument(help="Study input (.npz), see docs/replay.md.")],
+    study_input: Annotated[
+        Path,
+        typer.Argument(metavar="FILE", help="What each drone sensed and heard in each tick (.npz, docs/replay.md)."),
+    ],
     config: Annotated[
         Path | None, typer.Option("--config", help="TOML file; only its [estimator] table is read.")
     ] = None,
@@ -30,15 +33,15 @@ def estimate(
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
-    """Run one estimator per agent over a recording, in lockstep, and print the errors where it holds the truth."""
+    """Run one estimator per agent over a study input, in lockstep, and print the errors where it holds the truth."""
     from agent.config.reading import load_estimator_settings
     from fleetloc.output import progress_bar, write_json
     from fleetloc.warmup import announce
     from sim_bridge.studies.lockstep import run_lockstep
-    from sim_bridge.studies.study_input import load_recording
+    from sim_bridge.studies.study_input import load_study_input
 
     settings = load_estimator_settings(config, overrides or [])
-    fleet = load_recording(recording)
+    fleet = load_study_input(study_input)
     announce()
     with progress_bar("ticks", fleet.ticks + 1) as advance:
         result = run_lockstep(fleet, settings, lambda _tick: advance())
@@ -47,7 +50,7 @@ def estimate(
     figures = _figures(fleet, result)
     _print(fleet, figures)
     if json_file is not None:
-        write_json(json_file, {"recording": recording.name, "estimator": settings.kind, **figures})
+        write_json(json_file, {"study_input": study_input.name, "estimator": settings.kind, **figures})
 
 
 def _write(path: Path, result: LockstepResult) -> None:
@@ -57,7 +60,7 @@ def _write(path: Path, result: LockstepResult) -> None:
         np.savez_compressed(file, mean=result.mean, cov_diag=result.cov_diag, status=result.status)
 
 
-def _figures(recording: StudyInput, result: LockstepResult) -> dict[str, Any]:
+def _figures(study_input: StudyInput, result: LockstepResult) -> dict[str, Any]:
     """What there is to say about a run, per agent, with units in the keys."""
     import numpy as np
 
@@ -66,26 +69,26 @@ def _figures(recording: StudyInput, result: LockstepResult) -> dict[str, Any]:
     from estimators.model.layout import position, velocity
 
     agents = []
-    for slot, agent_id in enumerate(recording.agents.tolist()):
+    for slot, agent_id in enumerate(study_input.agents.tolist()):
         row: dict[str, Any] = {"id": agent_id}
         row["status"] = {
             status.name.lower(): int(np.count_nonzero(result.status[:, slot] == status)) for status in Status
         }
-        if recording.truth is not None and result.nees_full is not None:
-            own = result.mean[:, slot, :] - recording.truth.reshape(len(recording.truth), -1)
+        if study_input.truth is not None and result.nees_full is not None:
+            own = result.mean[:, slot, :] - study_input.truth.reshape(len(study_input.truth), -1)
             row["position_rmse_m"] = rms(own[1:, position(slot)])
             row["velocity_rmse_mps"] = rms(own[1:, velocity(slot)])
             row["norm_full_mean"] = float(np.linalg.norm(own[1:], axis=1).mean())
             row["norm_full_final"] = float(np.linalg.norm(own[-1]))
             row["anees"] = float(result.nees_full[1:, slot].mean())
         agents.append(row)
-    return {"ticks": recording.ticks + 1, "agents": agents, "late_records_dropped": int(result.dropped.sum())}
+    return {"ticks": study_input.ticks + 1, "agents": agents, "late_records_dropped": int(result.dropped.sum())}
 
 
-def _print(recording: StudyInput, figures: dict[str, Any]) -> None:
+def _print(study_input: StudyInput, figures: dict[str, Any]) -> None:
     from fleetloc.output import print_table
 
-    known = recording.truth is not None
+    known = study_input.truth is not None
     columns = ["agent", "ticks ok", "other"]
     if known:
         columns += ["position RMSE m", "velocity RMSE m/s", "fleet error", "at the end", "ANEES"]

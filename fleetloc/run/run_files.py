@@ -2,14 +2,14 @@
 
 =============================  ====================================================================
 ``fleet.toml``                 the effective configuration; every process of the run reads this one
-``truth.npz``                  where every drone truly was (`sim_bridge.truth`)
-``agent_001.estimates``        the last record of agent 1 (`agent.recording`)
-``agent_001.1.estimates``      the record before it, if the daemon was restarted; ``.2`` the next, ...
+``truth.npz``                  where every drone truly was (`sim_bridge.world.truth`)
+``agent_001.estimates``        the last estimate log of agent 1 (`agent.log.estimate_log`)
+``agent_001.1.estimates``      the one before it, if the daemon was restarted; ``.2`` the next, ...
 ``agent_001.mcap``, ``.tlog``  the flight log of its last daemon (`agent.log.flight_log`), likewise
 ``agent_001.json``             counters of its last daemon, likewise
 ``agent_001.log``              what the daemon said on stderr
 ``simulator.log``              what the simulator said
-``simulator.json``             how its run went (`sim_bridge.simulator.SimulatorReport`)
+``simulator.json``             how its run went (`sim_bridge.world.simulator.SimulatorReport`)
 ``report.json``                figures
 ``report.html``                the same for people, with plots
 =============================  ====================================================================

@@ -19,7 +19,7 @@ Floats = NDArray[np.float64]
 
 
 class StudyInputError(ValueError):
-    """A recording that cannot be used: names file, key, what was expected and what was found."""
+    """A study input that cannot be used: names file, key, what was expected and what was found."""
 
     def __init__(self, source: str, key: str, expected: str, found: str) -> None:
         super().__init__(f"{source}: {key}: expected {expected}, found {found}")
@@ -77,7 +77,7 @@ class StudyInput:
         return len(self.accel)
 
     def save(self, path: Path) -> None:
-        """Write the recording; optional arrays that are absent are left out."""
+        """Write the file; optional arrays that are absent are left out."""
         arrays = {field.name: getattr(self, field.name) for field in fields(self)}
         np.savez_compressed(path, **{key: value for key, value in arrays.items() if value is not None})
 
@@ -89,20 +89,20 @@ REQUIRED = (
 OPTIONAL = ("received", "delay_ticks", "truth")
 
 
-def load_recording(path: Path) -> StudyInput:
-    """Read and check a recording; raises `StudyInputError`."""
+def load_study_input(path: Path) -> StudyInput:
+    """Read and check a file; raises `StudyInputError`."""
     try:
         with path.open("rb") as file, NpzFile(file, allow_pickle=False) as archive:
             arrays = {key: np.asarray(archive[key]) for key in archive.files}
     except FileNotFoundError:
-        raise StudyInputError(str(path), "file", "a recording (.npz)", "no such file") from None
+        raise StudyInputError(str(path), "file", "a study input (.npz)", "no such file") from None
     except (ValueError, OSError, BadZipFile, EOFError, KeyError) as error:
-        raise StudyInputError(str(path), "file", "a recording (.npz without pickles)", str(error)) from None
-    return recording_from_arrays(arrays, str(path))
+        raise StudyInputError(str(path), "file", "a study input (.npz without pickles)", str(error)) from None
+    return study_input_from_arrays(arrays, str(path))
 
 
-def recording_from_arrays(arrays: Mapping[str, Any], source: str) -> StudyInput:
-    """Check arrays against the format and make a recording of them; raises `StudyInputError` naming ``source``."""
+def study_input_from_arrays(arrays: Mapping[str, Any], source: str) -> StudyInput:
+    """Check arrays against the format and make a study input of them; raises `StudyInputError` naming ``source``."""
     check = _Checker(arrays, source)
     period_s = check.number("period_s", positive=True)
     agents = check.agents()

@@ -22,7 +22,7 @@ from estimators.window.history import MeasurementWindow
 from estimators.window.problem import WindowProblem
 from estimators.window.solving import pre_estimation, solve_window
 from sim_bridge.studies.lockstep import Links, own_input, own_rows, run_lockstep
-from sim_bridge.studies.study_input import StudyInput, recording_from_arrays
+from sim_bridge.studies.study_input import StudyInput, study_input_from_arrays
 from tests.support import dense_reference as dense
 from tests.support import frozen_cases
 
@@ -61,7 +61,7 @@ class Case:
     @classmethod
     def load(cls, path: Path) -> Case:
         arrays, options = frozen_cases.load_case(path)
-        recording = recording_from_arrays(frozen_cases.case_recording(arrays, options), path.name)
+        recording = study_input_from_arrays(frozen_cases.case_recording(arrays, options), path.name)
         table = msgspec.convert(frozen_cases.case_settings(options), EstimatorSettings)
         return cls(arrays, options, recording, table)
 

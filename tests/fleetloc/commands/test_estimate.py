@@ -70,7 +70,7 @@ def test_figures(recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[
     # THEN they are those of the estimates that were written
     written = json.loads(figures.read_text())
     assert written["estimator"] == "dekf_ci"
-    assert written["recording"] == "flight.npz"
+    assert written["study_input"] == "flight.npz"
     assert written["ticks"] == 6
     assert written["late_records_dropped"] == 0
     assert [agent["id"] for agent in written["agents"]] == [1, 2, 3]
@@ -121,7 +121,7 @@ def put(key: str, value: Any) -> Callable[[dict[str, Any]], None]:
 def test_bad_recording_is_one_line(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], spoil: Callable[[dict[str, Any]], None], says: str
 ) -> None:
-    # GIVEN a recording with one fault, WHEN the command runs, THEN one line names file, key, expected and found
+    # GIVEN a study input with one fault, WHEN the command runs, THEN one line names file, key, expected and found
     arrays = recording_arrays()
     spoil(arrays)
     path = tmp_path / "flight.npz"
@@ -141,7 +141,7 @@ def test_file_that_is_no_recording(tmp_path: Path, capsys: pytest.CaptureFixture
     trap = tmp_path / "trap.npz"
     np.savez(trap, **{**recording_arrays(), "truth": np.array([object()], dtype=object)})
     missing = tmp_path / "no.npz"
-    for path, says in ((text, "expected a recording"), (trap, "without pickles"), (missing, "no such file")):
+    for path, says in ((text, "expected a study input"), (trap, "without pickles"), (missing, "no such file")):
         assert cli.main(["estimate", str(path)]) == BAD_INPUT
         err = capsys.readouterr().err
         assert str(path) in err

@@ -23,7 +23,7 @@ from sim_bridge.studies.monte_carlo import (
     window_mean,
     window_rms,
 )
-from sim_bridge.studies.study_input import recording_from_arrays
+from sim_bridge.studies.study_input import study_input_from_arrays
 from sim_bridge.studies.study_scenario import GRAPHS, StudyScenario, graph_of
 from tests.support.builders import recording_arrays
 
@@ -33,7 +33,7 @@ from tests.support.builders import recording_arrays
 @pytest.mark.parametrize("graph", GRAPHS)
 def test_every_graph_makes_a_valid_recording(graph: str) -> None:
     made = StudyScenario(graph=graph, samples=5).record(0, 0)
-    recording_from_arrays(recording_arrays(made), graph)
+    study_input_from_arrays(recording_arrays(made), graph)
     agents, edges = GRAPHS[graph]
     assert len(made.agents) == agents
     # ranges exist exactly along the edges, from both ends
@@ -181,7 +181,7 @@ def a_result(error: np.ndarray, truth: np.ndarray) -> LockstepResult:
 def test_errors_of_a_run_by_hand() -> None:
     # GIVEN agent 0 wrong by (3, 4, 0) m in its own position and 2 m in that of agent 1; agent 1 by 1 m/s in its speed
     arrays = recording_arrays(StudyScenario(graph="line", samples=1).record(0, 0))
-    made = recording_from_arrays(arrays, "x")
+    made = study_input_from_arrays(arrays, "x")
     truth = np.zeros((2, 2, 6))
     recording = replace(made, agents=np.array([1, 2]), truth=truth)
     error = np.zeros((2, 2, 12))

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from sim_bridge.studies.study_input import REQUIRED, StudyInputError, load_recording, recording_from_arrays
+from sim_bridge.studies.study_input import REQUIRED, StudyInputError, load_study_input, study_input_from_arrays
 from sim_bridge.studies.study_scenario import StudyScenario
 from tests.support.builders import recording_arrays
 
@@ -18,14 +18,14 @@ Arrays = dict[str, Any]
 
 
 def test_round_trip(tmp_path: Path) -> None:
-    # GIVEN a recording with everything in it
+    # GIVEN a study input with everything in it
     made = StudyScenario(graph="ring4", samples=6, blind=1).record(3, 0)
     made.received[2, 0, 1] = False
     made.delay_ticks[3, 1, 2] = 2
     path = tmp_path / "flight.npz"
     # WHEN it is saved and read, THEN nothing has changed
     made.save(path)
-    read = load_recording(path)
+    read = load_study_input(path)
     for field in fields(made):
         np.testing.assert_array_equal(getattr(read, field.name), getattr(made, field.name), err_msg=field.name)
     assert read.ticks == 6
@@ -35,7 +35,7 @@ def test_optional_keys_have_defaults() -> None:
     arrays = recording_arrays()
     for key in ("received", "delay_ticks", "truth"):
         del arrays[key]
-    read = recording_from_arrays(arrays, "flight.npz")
+    read = study_input_from_arrays(arrays, "flight.npz")
     assert read.received.all()
     assert not read.delay_ticks.any()
     assert read.truth is None
@@ -45,7 +45,7 @@ def test_optional_keys_have_defaults() -> None:
 def test_no_edges_is_a_fleet_of_loners() -> None:
     arrays = recording_arrays()
     arrays["edges"] = np.zeros((0, 2), np.int64)
-    assert recording_from_arrays(arrays, "x").edges.shape == (0, 2)
+    assert study_input_from_arrays(arrays, "x").edges.shape == (0, 2)
 
 
 def put(key: str, value: Any) -> Callable[[Arrays], None]:
@@ -143,7 +143,7 @@ BAD_FRACTIONS: dict[str, tuple[Callable[[Arrays], None], str]] = {
 
 @pytest.mark.parametrize("what", [*BAD, *BAD_FRACTIONS])
 def test_bad_array_is_refused(what: str, tmp_path: Path) -> None:
-    # GIVEN a recording with one fault
+    # GIVEN a study input with one fault
     arrays = recording_arrays()
     spoil, says = {**BAD, **BAD_FRACTIONS}[what]
     spoil(arrays)
@@ -151,7 +151,7 @@ def test_bad_array_is_refused(what: str, tmp_path: Path) -> None:
     np.savez(path, **arrays)
     # WHEN it is read, THEN the error names the file, the key, what was expected and what was found, in one line
     with pytest.raises(StudyInputError, match=says) as caught:
-        load_recording(path)
+        load_study_input(path)
     assert str(caught.value).startswith(f"{path}: ")
     assert "\n" not in str(caught.value)
 
@@ -161,7 +161,7 @@ def test_missing_key(key: str) -> None:
     arrays = recording_arrays()
     del arrays[key]
     with pytest.raises(StudyInputError, match=f"flight.npz: {key}: expected this key .*, found only "):
-        recording_from_arrays(arrays, "flight.npz")
+        study_input_from_arrays(arrays, "flight.npz")
 
 
 # numpy leaves the file of a torn archive to the garbage collector
@@ -175,19 +175,19 @@ def test_files_that_are_no_recording(tmp_path: Path) -> None:
     torn.write_bytes(torn.read_bytes()[:2000])
     empty = tmp_path / "empty.npz"
     empty.write_bytes(b"")
-    with pytest.raises(StudyInputError, match=r"no\.npz: file: expected a recording .*, found no such file"):
-        load_recording(missing)
+    with pytest.raises(StudyInputError, match=r"no\.npz: file: expected a study input .*, found no such file"):
+        load_study_input(missing)
     for path in (text, folder, torn, empty):
-        with pytest.raises(StudyInputError, match=r"file: expected a recording \(\.npz") as caught:
-            load_recording(path)
+        with pytest.raises(StudyInputError, match=r"file: expected a study input \(\.npz") as caught:
+            load_study_input(path)
         assert "\n" not in str(caught.value)
 
 
 def test_single_array_is_no_recording(tmp_path: Path) -> None:
     array = tmp_path / "array.npy"
     np.save(array, np.zeros(3))
-    with pytest.raises(StudyInputError, match=r"file: expected a recording \(\.npz"):
-        load_recording(array)
+    with pytest.raises(StudyInputError, match=r"file: expected a study input \(\.npz"):
+        load_study_input(array)
 
 
 def test_pickled_arrays_are_not_loaded(tmp_path: Path) -> None:
@@ -202,4 +202,4 @@ def test_pickled_arrays_are_not_loaded(tmp_path: Path) -> None:
     np.savez(path, **arrays)
     # THEN it is refused
     with pytest.raises(StudyInputError, match="without pickles"):
-        load_recording(path)
+        load_study_input(path)

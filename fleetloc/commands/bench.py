@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fleetloc.bench.fusion_command import fusion
+from fleetloc.options import Overrides
 
 if TYPE_CHECKING:
     from fleetloc.bench.sweep import Point
@@ -30,7 +31,8 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, links, blind drones, partition, Table I of the paper, speed.", rich_markup_mode=None
+        help="Studies: accuracy, links, blind drones, partition, faults, Table I of the paper, speed.",
+        rich_markup_mode=None,
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -40,6 +42,7 @@ def register(app: typer.Typer) -> None:
     bench.command("partition")(partition)
     bench.command("speed")(speed)
     bench.command("fusion")(fusion)
+    bench.command("faults")(faults)
     app.add_typer(bench, name="bench")
 
 
@@ -204,6 +207,31 @@ def partition(
     )
     folder = _prepare(out)
     _write(study(plan, runs=runs, jobs=_jobs(jobs), out=folder), folder, json_file)
+
+
+def faults(
+    config: Annotated[Path, typer.Argument(help="Configuration (TOML) with its [sim].")],
+    rows: Annotated[str, typer.Option(help="Names, separated by commas; empty: all.")] = "",
+    rows_from: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Rows of your own (TOML) in place of those that come along.")
+    ] = None,
+    runs: Runs = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first run; the next one has the next.")] = 1,
+    jobs: Jobs = 0,
+    overrides: Overrides = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Deceived receivers, blocked ranges, lying members: a fleet with each fault and, on the same seeds, without."""
+    from fleetloc.bench.fault_rows import ROWS_FILE, chosen_rows, read_rows
+    from fleetloc.bench.faults import faults as study
+    from fleetloc.options import with_options
+    from fleetloc.whole_config import load_whole
+
+    fleet = load_whole(config, with_options([], overrides))
+    selected = chosen_rows(read_rows(rows_from or ROWS_FILE), rows)
+    _prepare(None)
+    results = study(fleet, selected, runs=runs, seed=seed, jobs=_jobs(jobs))
+    _write({"config": str(config), "runs": runs, "seed": seed, "rows": results}, None, json_file)
 
 
 def _prepare(out: Path | None) -> Path | None:

@@ -1,0 +1,109 @@
+"""The rows of ``fleetloc bench faults``: what is injected, and what a fleet should make of it. They are data.
+
+``fault_rows.toml`` beside this file holds those that come with the installation; a file of one's own is like it.
+"""
+
+from __future__ import annotations
+
+import tomllib
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+
+from agent.config.fields import NotNegative, Table
+from agent.config.structs import read_struct
+from fleetloc.errors import InputError
+from sim_bridge.faults.fault_tables import FaultTable, UwbWrong
+
+ROWS_FILE = Path(__file__).with_name("fault_rows.toml")
+
+
+class FaultRow(Table, frozen=True):
+    """One row of the matrix. In its faults, agents are places in the fleet's file, from 1 on."""
+
+    name: str
+    """One word, for ``--rows``."""
+    title: str
+    """What happens, in a line."""
+    faults: Annotated[tuple[FaultTable, ...], msgspec.Meta(min_length=1)]
+    """All with an end: what comes after it is looked at too."""
+    after_s: NotNegative = 20.0
+    """How long the flight goes on after the last fault."""
+    smallest_fleet: int = 1
+    """Fleets with fewer drones leave the row out."""
+    ratio_at_most: float | None = None
+    """Bound of the fleet's position RMSE while it lasts, over that of the same seeds without it; absent = none."""
+    sigmas_at_most: float = 3.0
+    """Bound of the error in sigmas that 99 % of epochs keep, from the begin on."""
+    back_within_s: float = 10.0
+    """Bound of the time from the end until the fleet is as good as without."""
+    claim_at_most: float | None = None
+    """Bound of the claimed sigma over the actual error, rms of the hit drones while it lasts; absent = none."""
+
+    @property
+    def begin_s(self) -> float:
+        """When the first fault begins."""
+        return min(fault.from_s for fault in self.faults)
+
+    @property
+    def end_s(self) -> float:
+        """When the last fault ends."""
+        return max(fault.end_s for fault in self.faults)
+
+    @property
+    def duration_s(self) -> float:
+        """Of the flight."""
+        return self.end_s + self.after_s
+
+    def placed(self, ids: Sequence[int]) -> FaultRow | None:
+        """The row with a fleet's ids in place of places; ``None`` if it makes no sense for that fleet."""
+        found = [_placed(fault, ids) for fault in self.faults]
+        faults = tuple(fault for fault in found if fault is not None)
+        if not faults or len(ids) < self.smallest_fleet:
+            return None
+        return msgspec.structs.replace(self, faults=faults)
+
+
+class _Rows(Table, frozen=True):
+    rows: Annotated[tuple[FaultRow, ...], msgspec.Meta(min_length=1)]
+
+
+def _placed(fault: FaultTable, ids: Sequence[int]) -> FaultTable | None:
+    """A fault with ids in place of places; ``None`` if none of the drones that it names is there."""
+    agents = tuple(ids[place - 1] for place in fault.agents if place <= len(ids))
+    if not isinstance(fault, UwbWrong):
+        return msgspec.structs.replace(fault, agents=agents) if agents else None
+    pairs = tuple((ids[a - 1], ids[b - 1]) for a, b in fault.pairs if max(a, b) <= len(ids))
+    named = fault.agents or fault.pairs
+    return msgspec.structs.replace(fault, agents=agents, pairs=pairs) if agents or pairs or not named else None
+
+
+def read_rows(path: Path) -> tuple[FaultRow, ...]:
+    """The rows of a file; raises `InputError`, `OSError`."""
+    try:
+        document: Any = tomllib.loads(path.read_text(encoding="utf-8"))
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise InputError(str(path), "", "TOML", str(error)) from None
+    table, wrong = read_struct(document, _Rows)
+    if table is None:
+        raise InputError(str(path), wrong[0].key, wrong[0].expected, wrong[0].found)
+    for index, row in enumerate(table.rows):
+        for number, fault in enumerate(row.faults):
+            if fault.to_s is None or fault.to_s <= fault.from_s:
+                key = f"rows[{index}].faults[{number}].to_s"
+                raise InputError(str(path), key, f"an end after from_s = {fault.from_s:g}", str(fault.to_s))
+    names = [row.name for row in table.rows]
+    if len(set(names)) < len(names):
+        raise InputError(str(path), "rows.name", "a name of its own for each", ", ".join(names))
+    return table.rows
+
+
+def chosen_rows(rows: Iterable[FaultRow], names: str) -> tuple[FaultRow, ...]:
+    """Those with the names, separated by commas, in the order of the rows; empty: all. Raises `InputError`."""
+    by_name = {row.name: row for row in rows}
+    wanted = [name.strip() for name in names.split(",") if name.strip()]
+    if not set(wanted) <= by_name.keys():
+        raise InputError("--rows", "", f"some of {', '.join(by_name)}", names)
+    return tuple(row for name, row in by_name.items() if name in wanted or not wanted)

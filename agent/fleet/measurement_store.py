@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter, deque
-from collections.abc import Collection, Container, Iterable, Sequence
+from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
@@ -17,7 +17,6 @@ from transport.messages.measurement_body import (
     Measurements,
     RangeMeasurement,
     as_sent,
-    identity,
 )
 
 KEEP_TICKS = 64
@@ -80,11 +79,36 @@ class Neighbourhood:
 
 
 @dataclass(slots=True)
-class _OnItsWay:
-    """A record that is sent on, and the neighbours that are known to have it: it was in their packets."""
+class _Kept:
+    """A record that was taken in; ``held_by`` are neighbours known to have it: it was in their packets."""
 
     record: Measurement
     held_by: set[int] = field(default_factory=set)
+
+
+@dataclass(slots=True)
+class _OnItsWay:
+    """What is sent of one tick: our own records and those that we relay, each in the order in which they came."""
+
+    own: list[_Kept] = field(default_factory=list)
+    relayed: list[_Kept] = field(default_factory=list)
+    _held_by: frozenset[int] = frozenset()
+    """Neighbours that were found to have all of them."""
+
+    def add(self, kept: _Kept, *, is_own: bool) -> None:
+        """One more is sent."""
+        (self.own if is_own else self.relayed).append(kept)
+        self._held_by = frozenset()
+
+    def is_held_by(self, neighbours: frozenset[int]) -> bool:
+        """Whether all ``neighbours`` are known to have all of it."""
+        if neighbours <= self._held_by:
+            return True
+        for kept in (*self.own, *self.relayed):
+            if not kept.held_by >= neighbours:
+                return False
+        self._held_by = neighbours
+        return True
 
 
 class MeasurementStore:
@@ -99,13 +123,13 @@ class MeasurementStore:
         self._history_ticks = config.transport.history_ticks
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
-        self._seen: dict[int, dict[object, Measurement]] = {}
+        self._kept: dict[int, dict[bytes, _Kept]] = {}
         """The records taken in, by tick and identity."""
-        self._to_send: dict[int, tuple[dict[object, _OnItsWay], dict[object, _OnItsWay]]] = {}
-        """Own and relayed records by tick, each by its identity."""
+        self._to_send: dict[int, _OnItsWay] = {}
+        """Own and relayed records by tick."""
         self._echoed_after: deque[int] = deque(maxlen=ECHOES_REMEMBERED)
         """How many ticks after theirs our own records were said back, of late."""
-        self._echoes: dict[object, Measurement] = {}
+        self._echoes: dict[bytes, Measurement] = {}
         """What was heard since the last packet, by its identity."""
         self._rows: list[Measurement] = []
         self._inputs: list[AccelerationMeasurement] = []
@@ -118,27 +142,26 @@ class MeasurementStore:
         except EncodeError:
             self.refused["own: out of range"] += 1
             return None
-        return rounded if self._add(rounded, identity(rounded)) else None
+        if self._kept_of(rounded) is not None:
+            return None
+        self._add(rounded)
+        return rounded
 
     def add_heard(self, sender: int, records: Iterable[Measurement], tick: int) -> list[Measurement]:
         """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
         taken = []
         for record in records:
+            kept = self._kept_of(record)
             if self._wanted(record, tick):
-                name = identity(record)
-                self._echoes[name] = record
-                if self._add(record, name):
+                self._echoes[record.identity] = record
+                if kept is None:
+                    kept = self._add(record)
                     taken.append(record)
-            self._note_holder(sender, record, tick)
-        return taken
-
-    def _note_holder(self, sender: int, record: Measurement, tick: int) -> None:
-        for part in self._to_send.get(record.tick, ()):
-            sent = part.get(identity(record))
-            if sent is not None and sender not in sent.held_by:
-                sent.held_by.add(sender)
+            if kept is not None and sender not in kept.held_by:
+                kept.held_by.add(sender)
                 if record.observer == self._agent_id:
                     self._echoed_after.append(max(tick - record.tick, 0))
+        return taken
 
     def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
         """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
@@ -170,37 +193,40 @@ class MeasurementStore:
             self.refused["not located"] += len(self._rows) - len(waiting)
         self._rows = waiting
         self._inputs = [record for record in self._inputs if record.tick >= first]
-        for old in [t for t in self._seen if t < tick - KEEP_TICKS]:
-            self._seen.pop(old)
+        for old in [t for t in self._kept if t < tick - KEEP_TICKS]:
+            self._kept.pop(old)
             self._to_send.pop(old, None)
 
-    def packet(self, tick: int, exchange: int, neighbours: Collection[int]) -> Measurements:
+    def packet(self, tick: int, exchange: int, neighbours: frozenset[int]) -> Measurements:
         """What ``neighbours`` get in an exchange: what one of them may lack, newest first, then echoes.
 
         While nobody is heard all of the last ticks goes out.
         """
-        lacked: dict[object, Measurement] = {}
-        for of_tick in range(tick, tick - self._history_ticks, -1):
-            for part in self._to_send.get(of_tick, ()):
-                for name, sent in part.items():
-                    if not neighbours or not sent.held_by.issuperset(neighbours):
-                        lacked[name] = sent.record
+        lacked: dict[bytes, Measurement] = {}
+        for on_its_way in self._last_ticks(tick, tick):
+            if neighbours and on_its_way.is_held_by(neighbours):
+                continue
+            for kept in (*on_its_way.own, *on_its_way.relayed):
+                if not neighbours or not kept.held_by >= neighbours:
+                    lacked[kept.record.identity] = kept.record
         echoes = sorted(self._echoes.items(), key=lambda item: -item[1].tick)
         lacked.update((name, record) for name, record in echoes if name not in lacked)
         self._echoes = {}
         return Measurements(tick, tuple(lacked.values()), exchange)
 
-    def lacked(self, tick: int, neighbours: Collection[int]) -> bool:
+    def lacked(self, tick: int, neighbours: frozenset[int]) -> bool:
         """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get.
 
         Where links are slow no echo can be back yet of the last ticks' records: these are not asked for.
         """
         newest = tick - 1 - min(self._echoed_after, default=0)
+        return not all(on_its_way.is_held_by(neighbours) for on_its_way in self._last_ticks(newest, tick))
+
+    def _last_ticks(self, newest: int, tick: int) -> Iterator[_OnItsWay]:
+        """What is sent of the ticks from ``newest`` back to the oldest that is sent at a tick."""
         for of_tick in range(newest, tick - self._history_ticks, -1):
-            for part in self._to_send.get(of_tick, ()):
-                if not all(sent.held_by.issuperset(neighbours) for sent in part.values()):
-                    return True
-        return False
+            if of_tick in self._to_send:
+                yield self._to_send[of_tick]
 
     def _wanted(self, record: Measurement, tick: int) -> bool:
         """Whether a record that a neighbour sent is one to take in, if it is new."""
@@ -217,17 +243,19 @@ class MeasurementStore:
             return False
         return True
 
-    def _add(self, record: Measurement, name: object) -> bool:
-        """Take in a record by its identity; false if it is there already."""
-        seen = self._seen.setdefault(record.tick, {})
-        if name in seen:
-            return False
-        seen[name] = record
+    def _kept_of(self, record: Measurement) -> _Kept | None:
+        """What is kept of a record, if it was taken in."""
+        of_tick = self._kept.get(record.tick)
+        return None if of_tick is None else of_tick.get(record.identity)
+
+    def _add(self, record: Measurement) -> _Kept:
+        """Take in a record that is not there yet."""
+        kept = self._kept.setdefault(record.tick, {})[record.identity] = _Kept(record)
         if self.neighbourhood.sends(record):
-            own, relayed = self._to_send.setdefault(record.tick, ({}, {}))
-            (own if record.observer == self._agent_id else relayed)[name] = _OnItsWay(record)
+            on_its_way = self._to_send.setdefault(record.tick, _OnItsWay())
+            on_its_way.add(kept, is_own=record.observer == self._agent_id)
         if isinstance(record, AccelerationMeasurement):
             self._inputs.append(record)
         else:
             self._rows.append(record)
-        return True
+        return kept

@@ -165,7 +165,7 @@ def test_what_a_neighbour_lacks_of_earlier_ticks_is_told_in_further_packets(make
     # WHEN it says that it has them all, THEN two are enough again
     own = [r for o in first if isinstance(o, Tell) and isinstance(o.message, Measurements) for r in o.message.records]
     core.on_packet(received(2, Measurements(1002, tuple(own), 1)), 100.3)
-    latest = core.records.packet(1002, 0, (2,)).records
+    latest = core.records.packet(1002, 0, frozenset({2})).records
     core.on_packet(received(2, Measurements(1002, latest, 1)), 100.301)
     assert exchanges(finely(core, 100.305, 0.1)) == [0, 1]
 

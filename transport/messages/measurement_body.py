@@ -8,6 +8,9 @@ earlier ones; every record names the agent whose sensor it is. Wire form of a re
 
 ``age`` is the packet's tick minus the record's. Sigmas and half widths are rounded up, never down, so the
 receiver never trusts a sensor more than its owner does; a half width beyond float16 becomes "no bound".
+
+The same records come and go many times, sent again and relayed. So each is worked out once: a record remembers its
+identity and its bytes, and bytes that were decoded of late are known again by all of them.
 """
 
 from __future__ import annotations
@@ -17,6 +20,8 @@ import struct
 from collections.abc import Collection
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import cached_property, lru_cache
+from typing import ClassVar, NamedTuple
 
 from transport.errors import EncodeError, Reason, Rejected
 from transport.link.streams import MAX_AGENT_ID, MIN_AGENT_ID
@@ -31,6 +36,8 @@ MAX_POSITION_M = 1e6
 MAX_SPEED_MPS = 1e4
 MAX_RANGE_M = 1e5
 MAX_ACCEL_MPS2 = 1e4
+RECORDS_KNOWN_AGAIN = 4096
+"""How many decoded records are known again by their bytes: more than a fleet of ten sends anew in its history."""
 
 
 class MeasurementKind(IntEnum):
@@ -44,79 +51,146 @@ class MeasurementKind(IntEnum):
     ACCELERATION = 6
 
 
-@dataclass(frozen=True, slots=True)
-class PositionMeasurement:
+_Floats = tuple[float, ...]
+
+
+class _Parts(NamedTuple):
+    """The numbers of a record in their order on the wire, without observer and age."""
+
+    middle: _Floats
+    """Offset, other, anchor: what of these a kind has."""
+    values: _Floats
+    variances: _Floats
+    half_widths: _Floats
+
+
+@dataclass(frozen=True)
+class _Record:
+    """What all kinds have: an ``observer``, the ``tick`` they belong to, and what follows from the fields."""
+
+    kind: ClassVar[MeasurementKind]
+    limit: ClassVar[float]
+    """The largest magnitude that a value may have."""
+
+    observer: int
+    tick: int
+
+    @cached_property
+    def identity(self) -> bytes:
+        """What makes another record the same measurement, however often and by whomever it was sent.
+
+        Kind, observer and tick; offset, other agent and anchor as on the wire.
+        """
+        middle = self.parts().middle
+        return _IDENTITY.pack(self.kind, self.observer, self.tick) + _SINGLES[len(middle)].pack(*middle)
+
+    @cached_property
+    def wire(self) -> bytes | None:
+        """The record's bytes with age 0, ``None`` if it is too uncertain to be worth any; raises `EncodeError`."""
+        return _encode_record(self)
+
+    def parts(self) -> _Parts:
+        """The record's numbers."""
+        raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class PositionMeasurement(_Record):
     """A position fix of ``observer``: NED m, variances m2 and hard bounds m per axis (inf = none).
 
     ``offset_s`` is the instant of the measurement minus the time of ``tick``, here and below.
     """
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.POSITION
+    limit = MAX_POSITION_M
+
     position_m: Triple
     variance_m2: Triple
     half_width_m: Triple = NO_BOUND
     offset_s: float = 0.0
 
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s,), self.position_m, self.variance_m2, self.half_width_m)
 
-@dataclass(frozen=True, slots=True)
-class VelocityMeasurement:
+
+@dataclass(frozen=True)
+class VelocityMeasurement(_Record):
     """A velocity of ``observer``: NED m/s, variances (m/s)2 and hard bounds m/s per axis (inf = none)."""
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.VELOCITY
+    limit = MAX_SPEED_MPS
+
     velocity_mps: Triple
     variance_m2ps2: Triple
     half_width_mps: Triple = NO_BOUND
     offset_s: float = 0.0
 
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s,), self.velocity_mps, self.variance_m2ps2, self.half_width_mps)
 
-@dataclass(frozen=True, slots=True)
-class SpeedMeasurement:
+
+@dataclass(frozen=True)
+class SpeedMeasurement(_Record):
     """The norm of ``observer``'s velocity as measured, m/s (noise can make it negative)."""
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.SPEED
+    limit = MAX_SPEED_MPS
+
     speed_mps: float
     variance_m2ps2: float
     half_width_mps: float = math.inf
     offset_s: float = 0.0
 
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s,), (self.speed_mps,), (self.variance_m2ps2,), (self.half_width_mps,))
 
-@dataclass(frozen=True, slots=True)
-class RangeMeasurement:
+
+@dataclass(frozen=True)
+class RangeMeasurement(_Record):
     """The range from ``observer`` to agent ``other`` as measured, m."""
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.RANGE
+    limit = MAX_RANGE_M
+
     other: int
     range_m: float
     variance_m2: float
     half_width_m: float = math.inf
     offset_s: float = 0.0
 
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s, self.other), (self.range_m,), (self.variance_m2,), (self.half_width_m,))
 
-@dataclass(frozen=True, slots=True)
-class AnchorRangeMeasurement:
+
+@dataclass(frozen=True)
+class AnchorRangeMeasurement(_Record):
     """The range from ``observer`` to a fixed anchor at ``anchor_m`` (NED m) as measured, m."""
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.ANCHOR_RANGE
+    limit = MAX_RANGE_M
+
     anchor_m: Triple
     range_m: float
     variance_m2: float
     half_width_m: float = math.inf
     offset_s: float = 0.0
 
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s, *self.anchor_m), (self.range_m,), (self.variance_m2,), (self.half_width_m,))
 
-@dataclass(frozen=True, slots=True)
-class AccelerationMeasurement:
+
+@dataclass(frozen=True)
+class AccelerationMeasurement(_Record):
     """The acceleration of ``observer`` averaged over ``tick`` to ``tick + 1``: NED m/s2, gravity removed."""
 
-    observer: int
-    tick: int
+    kind = MeasurementKind.ACCELERATION
+    limit = MAX_ACCEL_MPS2
+
     accel_mps2: Triple
     variance_m2ps4: Triple
+
+    def parts(self) -> _Parts:
+        return _Parts((), self.accel_mps2, self.variance_m2ps4, ())
 
 
 Measurement = (
@@ -128,14 +202,6 @@ Measurement = (
     | AccelerationMeasurement
 )
 
-_KIND_OF = {
-    PositionMeasurement: MeasurementKind.POSITION,
-    VelocityMeasurement: MeasurementKind.VELOCITY,
-    SpeedMeasurement: MeasurementKind.SPEED,
-    RangeMeasurement: MeasurementKind.RANGE,
-    AnchorRangeMeasurement: MeasurementKind.ANCHOR_RANGE,
-    AccelerationMeasurement: MeasurementKind.ACCELERATION,
-}
 _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.POSITION: struct.Struct("<BHBf3f3e3e"),
     MeasurementKind.VELOCITY: struct.Struct("<BHBf3f3e3e"),
@@ -144,7 +210,11 @@ _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.ANCHOR_RANGE: struct.Struct("<BHBf3ffee"),
     MeasurementKind.ACCELERATION: struct.Struct("<BHB3f3e"),
 }
-_SINGLE, _SINGLES = struct.Struct("<f"), struct.Struct("<3f")
+_AGE_AT = 3
+"""Where the age stands in a record."""
+_IDENTITY = struct.Struct("<BHq")
+_SINGLES = [struct.Struct(f"<{count}f") for count in range(5)]
+"""What follows the identity's head: an agent's id is exact as a float32."""
 _HALF, _HALF_BITS = struct.Struct("<e"), struct.Struct("<H")
 RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
 
@@ -170,28 +240,14 @@ class EncodedMeasurements:
     left_out: int
 
 
-def identity(record: Measurement) -> tuple[MeasurementKind, int, int, int, float, Triple | None]:
-    """What makes two records the same measurement, however often and by whomever it was sent.
-
-    (kind, observer, other or 0, tick, offset as on the wire, anchor as on the wire).
-    """
-    other = record.other if isinstance(record, RangeMeasurement) else 0
-    offset = 0.0 if isinstance(record, AccelerationMeasurement) else _single(record.offset_s)
-    anchor = _singles(record.anchor_m) if isinstance(record, AnchorRangeMeasurement) else None
-    return _KIND_OF[type(record)], record.observer, other, record.tick, offset, anchor
-
-
 def as_sent(record: Measurement) -> Measurement:
     """The record with its numbers rounded as a receiver will see them; raises `EncodeError`.
 
     An agent that uses this for its own estimate works on the same numbers as everybody else. A record too
     uncertain to be sent (a sigma beyond float16) comes back as it is.
     """
-    encoded = _encode_record(record, record.tick)
-    if encoded is None:
-        return record
-    ids = (record.observer, record.other) if isinstance(record, RangeMeasurement) else (record.observer,)
-    return _record_from(_LAYOUT[_KIND_OF[type(record)]].unpack(encoded), record.tick, ids)
+    wire = record.wire
+    return record if wire is None else _decode_record(wire, record.tick)
 
 
 def encode_measurements(
@@ -202,17 +258,21 @@ def encode_measurements(
     Raises `EncodeError` for a record that is not a measurement: NaN, no variance, an id that is none, a tick
     later than the packet's.
     """
-    parts: list[bytes] = []
-    used = 0
+    body, count = bytearray(), 0
     for record in measurements.records:
-        encoded = _encode_record(record, measurements.tick)
-        if encoded is None:
+        age = measurements.tick - record.tick
+        if age < 0:
+            raise EncodeError(f"{record}: expected a tick from 0 to the packet's tick {measurements.tick}")
+        wire = record.wire
+        if wire is None or age > MAX_AGE_TICKS:
             continue
-        if used + len(encoded) > limit_bytes:
+        at = len(body)
+        if at + len(wire) > limit_bytes:
             break  # what follows matters less: better nothing than that in place of this one
-        parts.append(encoded)
-        used += len(encoded)
-    return EncodedMeasurements(b"".join(parts), len(parts), len(measurements.records) - len(parts))
+        body += wire
+        body[at + _AGE_AT] = age
+        count += 1
+    return EncodedMeasurements(bytes(body), count, len(measurements.records) - count)
 
 
 def decode_measurements(
@@ -220,29 +280,22 @@ def decode_measurements(
 ) -> Measurements:
     """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good."""
     records: list[Measurement] = []
-    at = 0
+    at, size = 0, len(body)
     for _ in range(count):
-        try:
-            layout = _LAYOUT[body[at]]
-            fields = layout.unpack_from(body, at)
-        except (IndexError, KeyError, struct.error):
-            raise Rejected(Reason.MALFORMED, f"record {len(records)} at byte {at} of {len(body)}") from None
-        records.append(_record_from(fields, tick, roster))
-        at += layout.size
-    if at != len(body):
-        raise Rejected(Reason.MALFORMED, f"{len(body) - at} bytes after the last record")
+        layout = _LAYOUT.get(body[at]) if at < size else None
+        if layout is None or at + layout.size > size:
+            raise Rejected(Reason.MALFORMED, f"record {len(records)} at byte {at} of {size}")
+        age_at, end = at + _AGE_AT, at + layout.size
+        record = _decode_record(body[at:age_at] + b"\0" + body[age_at + 1 : end], tick - body[age_at])
+        _check_known(record, roster)
+        records.append(record)
+        at = end
+    if at != size:
+        raise Rejected(Reason.MALFORMED, f"{size - at} bytes after the last record")
     return Measurements(tick, tuple(records), exchange)
 
 
 # --- one record --------------------------------------------------------------------------------------------
-
-
-def _single(value: float) -> float:
-    return float(_SINGLE.unpack(_SINGLE.pack(value))[0])
-
-
-def _singles(values: Triple) -> Triple:
-    return _triple(_SINGLES.unpack(_SINGLES.pack(*values)))
 
 
 def _half_up(value: float) -> float:
@@ -256,16 +309,16 @@ def _half_up(value: float) -> float:
     return rounded
 
 
-def _encode_record(record: Measurement, packet_tick: int) -> bytes | None:
-    """Bytes of a record, ``None`` if it is too old or too uncertain to be worth any."""
-    age = packet_tick - record.tick
-    if record.tick < 0 or age < 0:
-        raise EncodeError(f"{record}: expected a tick from 0 to the packet's tick {packet_tick}")
+def _encode_record(record: _Record) -> bytes | None:
+    """Bytes of a record with age 0, ``None`` if it is too uncertain to be worth any."""
+    if record.tick < 0:
+        raise EncodeError(f"{record}: expected a tick from 0 on")
     _check_ids(record)
-    values, limit, variances, half_widths = _numbers(record)
+    middle, values, variances, half_widths = record.parts()
+    _check_place(record, middle)
     for value in values:
-        if not -limit <= value <= limit:
-            raise EncodeError(f"{record}: values must be finite and at most {limit:g}")
+        if not -record.limit <= value <= record.limit:
+            raise EncodeError(f"{record}: values must be finite and at most {record.limit:g}")
     for variance in variances:
         if not 0 < variance < math.inf:
             raise EncodeError(f"{record}: variances must be finite and positive")
@@ -273,19 +326,14 @@ def _encode_record(record: Measurement, packet_tick: int) -> bytes | None:
         if not half_width > 0:
             raise EncodeError(f"{record}: half widths must be positive (inf = no bound)")
     sigmas = [_half_up(math.sqrt(variance)) for variance in variances]
-    if age > MAX_AGE_TICKS or math.inf in sigmas:
+    if math.inf in sigmas:
         return None
-    middle: tuple[float, ...] = () if isinstance(record, AccelerationMeasurement) else (_offset(record),)
-    if isinstance(record, RangeMeasurement):
-        middle += (record.other,)
-    elif isinstance(record, AnchorRangeMeasurement):
-        middle += _anchor(record)
-    kind = _KIND_OF[type(record)]
     rounded_widths = [_half_up(half_width) for half_width in half_widths]
-    return _LAYOUT[kind].pack(kind, record.observer, age, *middle, *values, *sigmas, *rounded_widths)
+    layout = _LAYOUT[record.kind]
+    return layout.pack(record.kind, record.observer, 0, *middle, *values, *sigmas, *rounded_widths)
 
 
-def _check_ids(record: Measurement) -> None:
+def _check_ids(record: _Record) -> None:
     good = MIN_AGENT_ID <= record.observer <= MAX_AGENT_ID
     if isinstance(record, RangeMeasurement):
         good = good and MIN_AGENT_ID <= record.other <= MAX_AGENT_ID and record.other != record.observer
@@ -293,43 +341,24 @@ def _check_ids(record: Measurement) -> None:
         raise EncodeError(f"{record}: expected distinct agent ids from {MIN_AGENT_ID} to {MAX_AGENT_ID}")
 
 
-def _offset(
-    record: PositionMeasurement | VelocityMeasurement | SpeedMeasurement | RangeMeasurement | AnchorRangeMeasurement,
-) -> float:
-    if not -MAX_OFFSET_S <= record.offset_s <= MAX_OFFSET_S:
-        raise EncodeError(f"{record}: offset must be within +-{MAX_OFFSET_S:g} s")
-    return record.offset_s
+def _check_place(record: _Record, middle: _Floats) -> None:
+    """The offset, and where an anchor stands."""
+    for offset in middle[:1]:
+        if not -MAX_OFFSET_S <= offset <= MAX_OFFSET_S:
+            raise EncodeError(f"{record}: offset must be within +-{MAX_OFFSET_S:g} s")
+    if isinstance(record, AnchorRangeMeasurement):
+        for component in record.anchor_m:
+            if not -MAX_POSITION_M <= component <= MAX_POSITION_M:
+                raise EncodeError(f"{record}: the anchor must be finite and at most {MAX_POSITION_M:g} m away")
 
 
-def _anchor(record: AnchorRangeMeasurement) -> Triple:
-    if not all(-MAX_POSITION_M <= component <= MAX_POSITION_M for component in record.anchor_m):
-        raise EncodeError(f"{record}: the anchor must be finite and at most {MAX_POSITION_M:g} m away")
-    return record.anchor_m
-
-
-_Floats = tuple[float, ...]
-
-
-def _numbers(record: Measurement) -> tuple[_Floats, float, _Floats, _Floats]:
-    """Values, the largest magnitude they may have, variances, half widths."""
-    match record:
-        case PositionMeasurement():
-            return record.position_m, MAX_POSITION_M, record.variance_m2, record.half_width_m
-        case VelocityMeasurement():
-            return record.velocity_mps, MAX_SPEED_MPS, record.variance_m2ps2, record.half_width_mps
-        case SpeedMeasurement():
-            return (record.speed_mps,), MAX_SPEED_MPS, (record.variance_m2ps2,), (record.half_width_mps,)
-        case RangeMeasurement() | AnchorRangeMeasurement():
-            return (record.range_m,), MAX_RANGE_M, (record.variance_m2,), (record.half_width_m,)
-        case AccelerationMeasurement():
-            return record.accel_mps2, MAX_ACCEL_MPS2, record.variance_m2ps4, ()
-
-
-def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection[int]) -> Measurement:
-    kind, observer, tick = fields[0], int(fields[1]), packet_tick - int(fields[2])
-    _known(observer, roster)
+@lru_cache(RECORDS_KNOWN_AGAIN)
+def _decode_record(wire: bytes, tick: int) -> Measurement:
+    """A record of its bytes with age 0 and its tick: of all that it says, so that no other is taken for it."""
     if tick < 0:
         raise Rejected(Reason.OUT_OF_RANGE, f"record of tick {tick}")
+    fields = _LAYOUT[wire[0]].unpack(wire)
+    kind, observer = fields[0], int(fields[1])
     if kind == MeasurementKind.ACCELERATION:
         accel = _bounded(fields[3:6], MAX_ACCEL_MPS2, "acceleration")
         return AccelerationMeasurement(observer, tick, _triple(accel), _triple(_variances(fields[6:9])))
@@ -347,7 +376,7 @@ def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]
         return SpeedMeasurement(observer, tick, speed, sigma, half_width, offset)
     if kind == MeasurementKind.RANGE:
-        other = _known(int(fields[4]), roster)
+        other = int(fields[4])
         if other == observer:
             raise Rejected(Reason.OUT_OF_RANGE, f"range of agent {observer} to itself")
         range_m = _bounded(fields[5:6], MAX_RANGE_M, "range")[0]
@@ -357,10 +386,12 @@ def _record_from(fields: tuple[float, ...], packet_tick: int, roster: Collection
     return AnchorRangeMeasurement(observer, tick, anchor, range_m, sigma, half_width, offset)
 
 
-def _known(agent_id: int, roster: Collection[int]) -> int:
-    if agent_id not in roster:
-        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {agent_id}")
-    return agent_id
+def _check_known(record: Measurement, roster: Collection[int]) -> None:
+    """Whom a record names must be of the fleet."""
+    if record.observer not in roster:
+        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {record.observer}")
+    if isinstance(record, RangeMeasurement) and record.other not in roster:
+        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {record.other}")
 
 
 def _bounded(values: _Floats, limit: float, what: str) -> _Floats:

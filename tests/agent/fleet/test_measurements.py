@@ -187,7 +187,7 @@ def test_what_is_old_of_the_future_or_our_own_is_refused(make_config: Callable[.
 
 def told(store: MeasurementStore, tick: int, *neighbours: int) -> list[tuple[int, int]]:
     """(observer, tick) of what a packet says, in its order."""
-    return [(record.observer, record.tick) for record in store.packet(tick, 0, neighbours).records]
+    return [(record.observer, record.tick) for record in store.packet(tick, 0, frozenset(neighbours)).records]
 
 
 def test_while_nobody_is_heard_packets_repeat_the_last_ticks_newest_first(
@@ -197,7 +197,7 @@ def test_while_nobody_is_heard_packets_repeat_the_last_ticks_newest_first(
     for tick in range(10):
         store.add_own(position(1, tick))
         store.add_own(acceleration(1, tick))
-    packet = store.packet(8, 1, ())
+    packet = store.packet(8, 1, frozenset())
     assert (packet.tick, packet.exchange) == (8, 1)
     assert [(record.observer, record.tick) for record in packet.records] == [(1, 8), (1, 7), (1, 6)]
 
@@ -209,17 +209,21 @@ def test_a_record_is_told_until_every_neighbour_has_said_it(make_config: Callabl
     store.add_heard(1, [position(1, 5)], 5)
     # THEN its own record goes to both, that of 1 is for 3
     assert told(store, 5, 1, 3) == [(2, 5), (1, 5)]
-    assert store.lacked(6, (1, 3))
+    assert store.lacked(6, frozenset({1, 3}))
     # WHEN 1 says our record back, THEN it is still told, for 3
     store.add_heard(1, [position(2, 5)], 6)
     assert told(store, 6, 1, 3) == [(2, 5), (1, 5)]
     # WHEN 3 says both, THEN neither is told any more
     store.add_heard(3, [position(2, 5), position(1, 5)], 6)
-    assert not store.lacked(7, (1, 3))
+    assert not store.lacked(7, frozenset({1, 3}))
     assert told(store, 7, 1, 3) == [(1, 5)]  # an echo: 3 knows then that we have it
     assert told(store, 8, 1, 3) == []
     # AND another neighbour that turns up gets all
     assert told(store, 8, 1, 3, 4) == [(2, 5), (1, 5)]
+    # AND what comes late, of a tick of which they had everything, is told
+    store.add_own(acceleration(2, 5))
+    assert store.lacked(7, frozenset({1, 3}))
+    assert told(store, 8, 1, 3) == [(2, 5)]
 
 
 def test_on_a_slow_link_nothing_is_asked_for_before_its_echo_can_be_back(
@@ -229,11 +233,11 @@ def test_on_a_slow_link_nothing_is_asked_for_before_its_echo_can_be_back(
     store = MeasurementStore(line(make_config, 2, "estimator.relay_hops=1"), 1)
     for tick in range(5, 9):
         store.add_own(position(1, tick))
-    assert store.lacked(9, (2,))
+    assert store.lacked(9, frozenset({2}))
     store.add_heard(2, [position(1, 5)], 8)
     # THEN those of the last three ticks are not lacked yet, an older one is
-    assert not store.lacked(9, (2,))
-    assert store.lacked(10, (2,))
+    assert not store.lacked(9, frozenset({2}))
+    assert store.lacked(10, frozenset({2}))
 
 
 def test_what_is_heard_is_said_back_once_behind_what_is_lacked(make_config: Callable[..., FleetConfig]) -> None:

@@ -26,7 +26,6 @@ from transport.messages.measurement_body import (
     as_sent,
     decode_measurements,
     encode_measurements,
-    identity,
 )
 
 ROSTER = frozenset(range(1, 1000))
@@ -108,7 +107,55 @@ def test_rounding_happens_once(record: Measurement) -> None:
     rounded = as_sent(record)
     # THEN relaying it changes nothing any more, and it is still the same measurement
     assert round_trip(rounded) == (rounded,)
-    assert identity(rounded) == identity(record)
+    assert rounded.identity == record.identity
+
+
+IDENTITY_ENDS = dict.fromkeys(MeasurementKind, 8) | {
+    MeasurementKind.RANGE: 10,
+    MeasurementKind.ANCHOR_RANGE: 20,
+    MeasurementKind.ACCELERATION: 4,
+}
+"""Byte of a record at which its values begin: up to there it says which measurement it is."""
+
+
+@settings(max_examples=400)
+@given(records, st.data())
+def test_a_record_of_changed_bytes_is_another_one(record: Measurement, data: st.DataObject) -> None:
+    # GIVEN a record that was sent and received, and is known again
+    body = encode_measurements(Measurements(TICK, (record,))).body
+    (known,) = decode_measurements(body, tick=TICK, count=1, roster=ROSTER).records
+    assert decode_measurements(body, tick=TICK, count=1, roster=ROSTER).records == (known,)
+    # WHEN one of its bytes is changed
+    place, change = data.draw(st.integers(0, len(body) - 1)), data.draw(st.integers(1, 255))
+    forged = bytearray(body)
+    forged[place] ^= change
+    try:
+        received = decode_measurements(bytes(forged), tick=TICK, count=1, roster=ROSTER)
+    except Rejected:
+        return
+    # THEN what comes out says what the changed bytes say, and is the same measurement only by the same name
+    assert encode_measurements(received).body == forged
+    same = received.records[0].identity == known.identity
+    assert same == (place >= IDENTITY_ENDS[known.kind])
+
+
+@given(records, st.integers(0, 100))
+def test_the_same_bytes_in_a_packet_of_another_tick_are_another_measurement(record: Measurement, later: int) -> None:
+    body = encode_measurements(Measurements(TICK, (record,))).body
+    (known,) = decode_measurements(body, tick=TICK, count=1, roster=ROSTER).records
+    (shifted,) = decode_measurements(body, tick=TICK + later, count=1, roster=ROSTER).records
+    assert shifted.tick == known.tick + later
+    assert (shifted.identity == known.identity) == (later == 0)
+
+
+@given(records)
+def test_a_record_of_someone_unknown_is_refused_however_often_it_came(record: Measurement) -> None:
+    body = encode_measurements(Measurements(TICK, (record,))).body
+    decode_measurements(body, tick=TICK, count=1, roster=ROSTER)
+    for stranger in {record.observer, record.other if isinstance(record, RangeMeasurement) else record.observer}:
+        with pytest.raises(Rejected) as refusal:
+            decode_measurements(body, tick=TICK, count=1, roster=ROSTER - {stranger})
+        assert refusal.value.reason is Reason.UNKNOWN_AGENT
 
 
 @settings(max_examples=100)
@@ -119,10 +166,10 @@ def test_the_first_records_that_fit_are_sent(given_records: list[Measurement]) -
     # THEN the body keeps its limit, what came is the beginning of what was given, and nothing vanished uncounted
     assert len(encoded.body) <= MAX_DATAGRAM_BODY_BYTES
     assert encoded.count + encoded.left_out == len(given_records)
-    assert [identity(record) for record in received] == [identity(r) for r in given_records[: encoded.count]]
+    assert [record.identity for record in received] == [r.identity for r in given_records[: encoded.count]]
     if encoded.left_out:
         left_out = given_records[encoded.count]
-        kind = identity(left_out)[0]
+        kind = left_out.identity[0]
         assert len(encoded.body) + RECORD_BYTES[kind] > MAX_DATAGRAM_BODY_BYTES
 
 

@@ -294,14 +294,18 @@ def speed(
     seed: Seed = 0,
     repeats: Annotated[int, typer.Option(min=1, help="Timed rounds over the windows, at most.")] = 30,
     windows: Annotated[int, typer.Option(min=1, max=64, help="Different windows per size.")] = 8,
-    sizes: Annotated[str, typer.Option(help="AGENTSxWINDOW, separated by commas.")] = "3x2,5x5,10x5,20x5",
+    sizes: Annotated[str, typer.Option(help="AGENTSxWINDOW, separated by commas, or none.")] = "3x2,5x5,10x5,20x5",
     cases: Annotated[str, typer.Option(help="Of free, loose, active: separated by commas.")] = "free,loose,active",
+    fleets: Annotated[str, typer.Option(help="DRONES[line|ring] of the whole step, or none.")] = "3,10,10ring",
+    kinds: Annotated[str, typer.Option(help="Our estimators in it; ratios are to the first.")] = "dmhe_shared",
+    ticks: Annotated[int, typer.Option(min=1, help="Timed ticks of its flights, at least.")] = 60,
+    rounds: Annotated[int, typer.Option(min=1, help="Times that its flights are gone through.")] = 5,
     json_file: JsonFile = None,
 ) -> None:
-    """Time our step against IPOPT, SQP+OSQP, SLSQP, a plain numpy build and DEKF-CI on the same windows."""
+    """Time our whole step against gtsam's smoothers, our window against IPOPT, SQP+OSQP, SLSQP and plain numpy."""
     from fleetloc.bench.speed.environment import use_one_thread
 
     use_one_thread()  # before numpy comes in
-    from fleetloc.bench.speed.command import run_command
+    from fleetloc.bench.speed.command import SpeedOptions, run_command
 
-    run_command(json_file, seed, repeats, windows, sizes, cases)
+    run_command(SpeedOptions(json_file, seed, repeats, windows, sizes, cases, fleets, kinds, ticks, rounds))

@@ -15,7 +15,7 @@ THREAD_VARIABLES = (
     "BLIS_NUM_THREADS",
     "VECLIB_MAXIMUM_THREADS",
 )
-PACKAGES = ("numpy", "scipy", "numba", "osqp", "daqp", "casadi")
+PACKAGES = ("numpy", "scipy", "numba", "osqp", "daqp", "casadi", "gtsam")
 
 
 def use_one_thread() -> None:

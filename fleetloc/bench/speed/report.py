@@ -12,6 +12,8 @@ from rich.console import Console
 from rich.table import Table
 
 from fleetloc.bench.speed.environment import describe
+from fleetloc.bench.speed.fleet import report as fleet_report
+from fleetloc.bench.speed.fleet.study import FleetPlan, FleetResult
 from fleetloc.bench.speed.study import CaseResult, SizeResult, SpeedPlan
 
 MEANING = {
@@ -21,7 +23,9 @@ MEANING = {
 }
 
 
-def as_document(plan: SpeedPlan, results: Sequence[SizeResult]) -> dict[str, Any]:
+def as_document(
+    plan: SpeedPlan, results: Sequence[SizeResult], fleet_plan: FleetPlan, fleets: Sequence[FleetResult]
+) -> dict[str, Any]:
     """The JSON document; a figure that does not apply is nan."""
     return {
         "command": "bench speed",
@@ -31,6 +35,13 @@ def as_document(plan: SpeedPlan, results: Sequence[SizeResult]) -> dict[str, Any
         "machine": describe(),
         "meaning": MEANING,
         "sizes": msgspec.to_builtins(list(results)),
+        "whole_step": {
+            "kinds": list(fleet_plan.kinds),
+            "ticks": fleet_plan.ticks,
+            "rounds": fleet_plan.rounds,
+            "meaning": fleet_report.MEANING,
+            "fleets": msgspec.to_builtins(list(fleets)),
+        },
     }
 
 

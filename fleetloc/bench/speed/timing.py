@@ -65,7 +65,7 @@ def time_interleaved(
         timings[method.name].answers = [call() for call in method.calls]
         spent = max(clock() - begun, 1e-9)
         rounds[method.name] = max(1, min(repeats, int(limit_s / spent)))
-    with _collector_off():
+    with collector_off():
         for round_ in range(max(rounds.values(), default=0)):
             playing = [method for method in methods if round_ < rounds[method.name]]
             for window in range(max(len(method.calls) for method in playing)):
@@ -81,7 +81,7 @@ def time_interleaved(
 
 
 @contextmanager
-def _collector_off() -> Iterator[None]:
+def collector_off() -> Iterator[None]:
     """No garbage collection in a timed call; what is there is collected before."""
     enabled = gc.isenabled()
     gc.collect()

@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -43,6 +44,7 @@ MEAN_DEGREE = 4.0
 """Of the random geometric graphs, and wanted of the agent whose windows are taken."""
 
 Edges = tuple[tuple[int, int], ...]
+Graph = Literal["line", "ring", "random geometric"]
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,7 +55,7 @@ class Size:
     window: int
 
     @property
-    def graph(self) -> str:
+    def graph(self) -> Graph:
         """Kind of graph that fleets of this size get."""
         return "line" if self.agents == 3 else "ring" if self.agents == 5 else "random geometric"
 
@@ -149,19 +151,18 @@ def capture_windows(size: Size, count: int, seed: int) -> list[BenchWindow]:
     return captured
 
 
-def study_recording(size: Size, count: int, seed: int) -> StudyInput:
-    """The flight that `capture_windows` takes ``count`` windows from."""
+def study_recording(size: Size, count: int, seed: int, graph: Graph | None = None) -> StudyInput:
+    """The flight that `capture_windows` takes ``count`` windows from; ``graph`` None: the size's own."""
     rng = np.random.default_rng([seed, size.agents, size.window])
-    centers, edges = _fleet(rng, size)
+    centers, edges = _fleet(rng, size.agents, size.graph if graph is None else graph)
     return _fly(rng, centers, edges, TRANSIENT_TICKS + TICKS_BETWEEN_WINDOWS * (count - 1))
 
 
-def _fleet(rng: np.random.Generator, size: Size) -> tuple[Matrix, Edges]:
+def _fleet(rng: np.random.Generator, n: int, graph: Graph) -> tuple[Matrix, Edges]:
     """Centres of the circles ``(n, 3)`` NED m, and the edges."""
-    n = size.agents
-    if size.graph != "random geometric":
+    if graph != "random geometric":
         centers = rng.uniform(-8.0, 8.0, (n, 3))
-        closing = ((n - 1, 0),) if size.graph == "ring" else ()
+        closing = ((n - 1, 0),) if graph == "ring" else ()
         return centers, (*((a, a + 1) for a in range(n - 1)), *closing)
     side = 6.0 * math.sqrt(n)
     while True:

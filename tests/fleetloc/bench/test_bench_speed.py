@@ -16,6 +16,7 @@ from estimators.settings import EstimatorSettings
 from fleetloc import cli
 from fleetloc.bench.speed.bounds import Bounds
 from fleetloc.bench.speed.environment import THREAD_VARIABLES
+from fleetloc.bench.speed.fleet.study import FleetPlan
 from fleetloc.bench.speed.own import filter_step, our_step
 from fleetloc.bench.speed.plain_numpy import PlainModel, PlainStep, prior_moments
 from fleetloc.bench.speed.report import as_document
@@ -172,7 +173,7 @@ def test_methods_agree_where_bounds_are_active(result: SizeResult) -> None:
 @needs_casadi
 def test_document_has_every_figure_and_no_nan(result: SizeResult, tmp_path: Path) -> None:
     target = tmp_path / "speed.json"
-    write_json(target, as_document(SpeedPlan(sizes=(SMALL,)), [result]))
+    write_json(target, as_document(SpeedPlan(sizes=(SMALL,)), [result], FleetPlan(), []))
     document = json.loads(target.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     (size,) = document["sizes"]
     assert (size["agents"], size["window_ticks"], size["regional_agents"]) == (3, 2, 3)
@@ -277,6 +278,8 @@ def test_missing_casadi_is_one_line(
         ("--sizes", "2x5", "at least 3 agents"),
         ("--sizes", "3x2,", "AGENTSxWINDOW"),
         ("--cases", "tight", "free or loose or active"),
+        ("--fleets", "3star", "3 to 100 drones"),
+        ("--kinds", "kalman", "dmhe_shared"),
         ("--json", "tests", "a file"),
     ],
 )

@@ -17,7 +17,23 @@ from fleetloc.verbosity import set_verbosity
 Verbose = Annotated[int, typer.Option("--verbose", "-v", count=True, show_default=False, help="Say more on stderr.")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say on stderr what is wrong, nothing else.")]
 ARGUMENT_TYPE = re.compile(r"(?<=[A-Z]) <[^ >|]+>(?= )")
-BY_NAME = {"--out": "FOLDER", "--duration": "S", "--timeout": "S", "--wait": "S", "--from": "S", "--to": "S"}
+LISTS = (
+    "losses", "delays", "channels", "methods", "agents", "gps-shares", "start-offsets", "sizes", "cases", "rows",
+    "fleets", "kinds",
+)  # fmt: skip
+BY_NAME = {
+    **dict.fromkeys(("--out", "--copy"), "FOLDER"),
+    **dict.fromkeys(("--duration", "--timeout", "--wait", "--from", "--to"), "S"),
+    **dict.fromkeys(("--ranges", "--truth", "--mission"), "FILE"),
+    **dict.fromkeys(("--connect", "--router"), "ENDPOINT"),
+    **dict.fromkeys(("--namespace", "--frame"), "NAME"),
+    **dict.fromkeys((f"--{name}" for name in LISTS), "LIST"),
+    "--drop-gps": "ID[:FROM,TO]",
+    "--estimator": "KIND",
+    "--arrival": "WHEN",
+    "--graph": "GRAPH",
+}
+"""What stands for a value in help, by the option."""
 PLACEHOLDERS: dict[Any, str] = {int: "N", float: "NUMBER", Path: "FILE", str: "TEXT"}
 """What stands for a value in help, by its type, where the option says nothing better."""
 

@@ -192,14 +192,14 @@ class TransportTable(Table, frozen=True):
 
 
 class RecordTable(Table, frozen=True):
-    """``[record]``: flight records on disk."""
+    """``[record]``: flight logs on disk."""
 
     directory: str | None = None
     """Relative to the working folder; absent = record nothing."""
     flight: bool = True
-    """Whether to write a flight record beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
+    """Whether to write a flight log beside them: all that came in (.tlog, .mcap), so that it can be repeated."""
     flight_max_mb: Positive = 2000.0
-    """Of a flight record, both files together; it ends here, the daemon goes on."""
+    """Of a flight log, both files together; it ends here, the daemon goes on."""
 
 
 class HealthTable(Table, frozen=True):

@@ -56,7 +56,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """One message of an estimate channel.
 
     The estimate is of fleet time ``t_s``, the start of its tick, and was out at ``published_s``. ``agents`` by
-    `agent_key`. ``inputs``: how many inputs the agent had taken in by then, in a flight record.
+    `agent_key`. ``inputs``: how many inputs the agent had taken in by then, in a flight log.
     """
 
     tick: int

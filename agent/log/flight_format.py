@@ -1,4 +1,4 @@
-"""What a flight record holds: the texts at its begin and end, and how inputs are laid down in channels.
+"""What a flight log holds: the texts at its begin and end, and how inputs are laid down in channels.
 
 docs/replay.md describes the files for users. Every input is a JSON message of its own channel, numbered in
 the order of taking in (``sequence``). Bytes are base64. MAVLink bytes are not here but in the .tlog: an input

@@ -1,4 +1,4 @@
-"""The flight record of a daemon: what it received (.tlog) and everything else that went in and came out (.mcap).
+"""The flight log of a daemon: what it received (.tlog) and everything else that went in and came out (.mcap).
 
 The daemon's loop only appends to a list; a thread encodes, compresses and writes. A record is a beginning of the
 flight without gaps, or it could not be repeated: where it cannot go on (size, disk full, disk failing or too
@@ -59,7 +59,7 @@ class FlightLog:
         """
         self._files = _Files(stem, config, start)
         self._limit = limit
-        self._who = f"agent {start.agent}: flight record {stem}{SUFFIX}"
+        self._who = f"agent {start.agent}: flight log {stem}{SUFFIX}"
         self._batch: list[_Entry] = []
         self._inputs = 0
         self._closing = False
@@ -68,7 +68,7 @@ class FlightLog:
         self._waiting: queue.SimpleQueue[list[_Entry] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         if threaded:
-            self._thread = threading.Thread(target=self._work, name="flight record", daemon=True)
+            self._thread = threading.Thread(target=self._work, name="flight log", daemon=True)
             self._thread.start()
 
     # --- on the daemon's loop -------------------------------------------------------------------------------

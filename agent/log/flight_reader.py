@@ -1,4 +1,4 @@
-"""Reads flight records back, as far as they go: a record that was cut off anywhere gives its beginning."""
+"""Reads flight logs back, as far as they go: a record that was cut off anywhere gives its beginning."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ RecordedEntry = RecordedInput | EstimateMessage
 
 
 class FlightReader:
-    """One agent's flight record.
+    """One agent's flight log.
 
     ``start`` says how the run began. Iterating gives inputs and estimates in the order in which the agent took them
     in and gave them out; after that ``ended`` says why there are no more (`agent.flight_format.CLOSED`,
@@ -52,7 +52,7 @@ class FlightReader:
     """
 
     def __init__(self, path: Path) -> None:
-        """Open ``path`` (.mcap); the .tlog is beside it. Raises `LogFileError` if it is no flight record."""
+        """Open ``path`` (.mcap); the .tlog is beside it. Raises `LogFileError` if it is no flight log."""
         self.path = path
         self.ended = ""
         try:
@@ -74,7 +74,7 @@ class FlightReader:
             self.ended = f"{CUT_OFF}: {type(error).__name__}"
 
     def _start(self, stream: IO[bytes]) -> FlightStart:
-        where = f"record {self.path}: expected a flight record"
+        where = f"record {self.path}: expected a flight log"
         try:
             for record in _records(stream):
                 if isinstance(record, Metadata) and record.name == START:

@@ -1,4 +1,4 @@
-"""What a daemon keeps of its run in its record's folder: estimates, flight record, and at the end its counters."""
+"""What a daemon keeps of its run in its record's folder: estimates, flight log, and at the end its counters."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SOFTWARE = ("fleetloc", "numpy", "numba")
 
 
 class RunLogs(Observer):
-    """The files ``agent_001.*`` of one run; ``flight`` is the journal of a flight record, if one is wanted."""
+    """The files ``agent_001.*`` of one run; ``flight`` is the journal of a flight log, if one is wanted."""
 
     def __init__(
         self, config: FleetConfig, agent_id: int, directory: Path, trust: Trust, *, unix_s: float, host_s: float
@@ -49,7 +49,7 @@ class RunLogs(Observer):
             self.flight = FlightLog(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
 
     def counters(self) -> dict[str, int]:
-        """What was not written, and how far the flight record is."""
+        """What was not written, and how far the flight log is."""
         flight = {} if self.flight is None else dict(self.flight.counters)
         return {"record estimates skipped": self._estimates.skipped} | flight
 
@@ -71,7 +71,7 @@ class RunLogs(Observer):
 
 
 def flight_start(config: FleetConfig, agent_id: int, trust: Trust, unix_s: float, host_s: float) -> FlightStart:
-    """The begin of a flight record."""
+    """The begin of a flight log."""
     versions = [f"{name} {_version(name)}" for name in SOFTWARE]
     return FlightStart(
         agent=agent_id,

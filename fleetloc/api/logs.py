@@ -1,4 +1,4 @@
-"""What a notebook needs: estimate logs, flight records and truth as arrays, and flights repeated."""
+"""What a notebook needs: estimate logs, flight logs and truth as arrays, and flights repeated."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ def read_estimate_log(path: str | Path) -> EstimateLog:
 
 
 def read_flight_estimates(path: str | Path) -> Iterator[EstimateMessage]:
-    """The estimates in a flight record (``agent_001.mcap`` with its .tlog beside it), in their order.
+    """The estimates in a flight log (``agent_001.mcap`` with its .tlog beside it), in their order.
 
     Each has ``tick``, ``t_s``, ``published_s``, ``status``, ``on_time``, ``agents`` by name (``agent_001``) and
     ``arrays()``, mean and 1-sigma ``(6n,)``. Raises `LogFileError`.
@@ -104,7 +104,7 @@ def read_truth(path: str | Path) -> Truth:
 
 
 def replay_flight_log(path: str | Path, config: FleetConfig | None = None) -> flight_log_replay.FlightLogReplay:
-    """Repeat a flight record (``agent_001.mcap`` with its .tlog beside it) and compare with what was estimated.
+    """Repeat a flight log (``agent_001.mcap`` with its .tlog beside it) and compare with what was estimated.
 
     Without ``config`` it runs with the configuration it was flown with. Raises `LogFileError`.
     """

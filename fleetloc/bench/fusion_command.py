@@ -18,7 +18,10 @@ def fusion(
     seed: Annotated[int, typer.Option("--seed")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
 ) -> None:
-    """Fu, Bi and Gao's filters by Monte Carlo, beside the figures of an independent implementation."""
+    """Fu, Bi and Gao's filters over a channel that holds and delays.
+
+    By Monte Carlo, beside the figures of an independent implementation.
+    """
     from fleetloc.bench.lossy_fusion import METHODS, SETTINGS, study
     from fleetloc.output import print_table, progress_bar, write_json
 

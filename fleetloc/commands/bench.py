@@ -31,8 +31,7 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, links, blind drones, partition, faults, Table I of the paper, speed.",
-        rich_markup_mode=None,
+        help="Studies: accuracy, loss, faults, blind drones, speed, Table I.", rich_markup_mode=None
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -59,7 +58,10 @@ def table1(
     start: StartKind = "paper",
     json_file: JsonFile = None,
 ) -> None:
-    """Table I of Borelle et al. 2023: four distributed estimators on the paper's fleet of three."""
+    """Table I of the paper: four estimators on its fleet.
+
+    The paper is Borelle et al. 2023.
+    """
     from fleetloc.bench.accuracy import table1 as study
     from fleetloc.output import write_json
     from fleetloc.warmup import announce
@@ -97,7 +99,10 @@ def accuracy(
     out: OutFolder = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Accuracy and consistency (ANEES) of all estimators on the same runs, also along a few axes."""
+    """Accuracy and consistency (ANEES) of all estimators.
+
+    All fly the same runs; also along a few axes.
+    """
     from fleetloc.bench.accuracy import accuracy as study
     from fleetloc.bench.methods import chosen, default_methods
     from fleetloc.errors import InputError
@@ -145,7 +150,10 @@ def loss(
     out: OutFolder = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Accuracy and consistency when packets are lost, late, doubled or out of order, beside what could be known."""
+    """The same when packets are lost, late, doubled or out of order.
+
+    Beside it stands what could be known.
+    """
     from fleetloc.bench.links import CHANNELS
     from fleetloc.bench.links import loss as study
     from fleetloc.bench.methods import chosen, methods_with_genie
@@ -172,7 +180,10 @@ def blind(
     jobs: Jobs = 0,
     json_file: JsonFile = None,
 ) -> None:
-    """A drone without GPS in several graphs: its error, its consistency, and whether it says that it is lost."""
+    """A drone without GPS in several graphs.
+
+    Its error, its consistency, and whether it says that it is lost.
+    """
     from fleetloc.bench.blind import blind as study
     from fleetloc.bench.methods import chosen, default_methods
 
@@ -196,7 +207,10 @@ def partition(
     out: OutFolder = None,
     json_file: JsonFile = None,
 ) -> None:
-    """A mesh of five falls apart into two and three and heals: are islands consistent, when do they agree again."""
+    """A mesh of five falls apart into two and three, and heals.
+
+    Are the islands consistent, and when do they agree again?
+    """
     from estimators.settings import default_settings
     from fleetloc.bench.partition import PartitionPlan
     from fleetloc.bench.partition import partition as study
@@ -221,7 +235,10 @@ def faults(
     overrides: Overrides = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Deceived receivers, blocked ranges, lying members: a fleet with each fault and, on the same seeds, without."""
+    """Deceived receivers, blocked ranges, lying members.
+
+    A fleet flies with each fault and, on the same seeds, without.
+    """
     from fleetloc.bench.fault_rows import ROWS_FILE, chosen_rows, read_rows
     from fleetloc.bench.faults import faults as study
     from fleetloc.options import with_options
@@ -302,7 +319,10 @@ def speed(
     rounds: Annotated[int, typer.Option(min=1, help="Times that its flights are gone through.")] = 5,
     json_file: JsonFile = None,
 ) -> None:
-    """Time our whole step against gtsam's smoothers, our window against IPOPT, SQP+OSQP, SLSQP and plain numpy."""
+    """Time of our step beside other solvers.
+
+    The whole step beside gtsam's smoothers, our window beside IPOPT, SQP+OSQP, SLSQP and plain numpy.
+    """
     from fleetloc.bench.speed.environment import use_one_thread
 
     use_one_thread()  # before numpy comes in

@@ -33,7 +33,9 @@ def check(
         Path | None, typer.Option("--json", help="Write mistakes and warnings here; - is the terminal.")
     ] = None,
 ) -> None:
-    """Check a configuration, its simulated scenario and its security profile; starts nothing and opens nothing.
+    """Check a configuration; starts nothing and opens nothing.
+
+    Its simulated scenario and its security profile are checked too.
 
     All mistakes are told at once, each with its file and line; warnings are about what is right and seldom meant.
     On the ground, where the authority's key is, the keys of every agent are checked, elsewhere those that are here.

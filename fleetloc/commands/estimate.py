@@ -33,7 +33,10 @@ def estimate(
     ] = None,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
-    """Run one estimator per agent over a study input, in lockstep, and print the errors where it holds the truth."""
+    """Run the estimators tick by tick over a study input.
+
+    One per agent, in lockstep. The errors are printed where the file holds the truth.
+    """
     from agent.config.reading import load_estimator_settings
     from fleetloc.output import progress_bar, write_json
     from fleetloc.warmup import announce

@@ -18,7 +18,10 @@ def examples(
         Path | None, typer.Option("--copy", help="Copy them into this folder, which must be new or empty.")
     ] = None,
 ) -> None:
-    """List the example configurations and the systemd unit that are installed, or copy them."""
+    """List the examples that come with fleetloc, or copy them.
+
+    They are configurations and the systemd unit.
+    """
     from fleetloc import examples as held
 
     if folder is not None:

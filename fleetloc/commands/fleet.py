@@ -44,7 +44,7 @@ def fleet(
         bool, typer.Option("--lockstep", help="Virtual time in one process: fast, and the same at every run.")
     ] = False,
 ) -> None:
-    """Fly a simulated fleet with one daemon per drone, show it live, and write a report.
+    """Fly a simulated fleet, one daemon per drone, and report.
 
     Ends after the duration or on Ctrl-C; the report is written in either case.
     """

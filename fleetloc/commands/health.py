@@ -22,7 +22,10 @@ def health(
     ] = False,
     timeout_s: Annotated[float, typer.Option("--timeout", help="Seconds to wait for the answer.")] = 3.0,
 ) -> None:
-    """Ask a daemon how it is: exit code 0 if it runs and is not at fault, 1 if it is, 3 if nobody answers."""
+    """Ask a running daemon how it is.
+
+    Exit codes: 0 it runs and is not at fault, 1 it is, 3 nobody answers.
+    """
     from agent.watch.health_query import STALE_AFTER_S, ask
 
     answer = ask(socket, timeout_s)

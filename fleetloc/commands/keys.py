@@ -37,7 +37,10 @@ def init(
         bool, typer.Option("--missing", help="Make only what is not there, e.g. certificates beside older keys.")
     ] = False,
 ) -> None:
-    """Make the folder with everything for every agent; nothing that exists is overwritten."""
+    """Make the folder with everything for every agent.
+
+    Nothing that exists is overwritten.
+    """
     keys = _keys(config, days=days)
     keys.init(missing_only=missing)
     _print(keys)
@@ -52,7 +55,7 @@ def add(config: Config, agent_id: AgentId, days: Days = 90) -> None:
 
 
 def list_all(config: Config) -> None:
-    """Show what is there, by fingerprint, and when certificates expire."""
+    """Show what is there, and when certificates expire."""
     _print(_keys(config))
 
 
@@ -64,9 +67,10 @@ def rotate(
     mavlink: Annotated[bool, typer.Option("--mavlink", help="With --id: the key of its MAVLink link.")] = False,
     days: Days = 90,
 ) -> None:
-    """Give an agent a new signing key and certificate, or replace what is named.
+    """Replace the signing key and certificate of an agent.
 
-    The signing key and group key from before are accepted until `retire`, a certificate until it expires.
+    Or what is named. The signing key and group key from before are accepted until `retire`, a certificate until it
+    expires.
     """
     keys = _keys(config, agent_id, days=days)
     _one_of(agent_id is not None, group, observer)
@@ -111,7 +115,10 @@ def export(
     agent_id: OptionalId = None,
     observer: Annotated[bool, typer.Option("--observer", help="For someone who only listens.")] = False,
 ) -> None:
-    """Copy what one drone needs, and nothing else, into a new folder: no other drone's secret, no authority's key."""
+    """Copy what one drone needs into a new folder.
+
+    And nothing else: no other drone's secret, no authority's key.
+    """
     keys = _keys(config, agent_id)
     _one_of(agent_id is not None, observer)
     files = keys.export(agent_id, out)
@@ -119,7 +126,10 @@ def export(
 
 
 def passphrase(config: Config, agent_id: AgentId) -> None:
-    """Print the passphrase to type into a ground station that sets MAVLink signing up on an agent's autopilot."""
+    """Print the passphrase of an agent's MAVLink link.
+
+    It is typed into the ground station that sets signing up on the autopilot.
+    """
     from transport.security.shared_keys import load_mavlink_passphrase
 
     typer.echo(load_mavlink_passphrase(_keys(config, agent_id).folder, agent_id))

@@ -26,7 +26,10 @@ def monitor(
     table: Annotated[bool, typer.Option("--table/--no-table", help="Show the table in the terminal.")] = True,
     duration_s: Annotated[float | None, typer.Option("--duration", help="End after so many seconds.")] = None,
 ) -> None:
-    """Show a fleet in the terminal and on a local web page, until Ctrl-C; it listens and never sends."""
+    """Show a fleet in the terminal and on a local web page.
+
+    It listens and never sends, until Ctrl-C.
+    """
     import asyncio
 
     from agent.config.reading import load_config

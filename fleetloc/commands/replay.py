@@ -22,16 +22,16 @@ def register(app: typer.Typer) -> None:
 
 def replay(
     config: Annotated[
-        Path, typer.Argument(help="Configuration (TOML; origin optional), or 'recorded': that of flight records.")
+        Path, typer.Argument(help="Configuration (TOML; origin optional), or 'recorded': that of flight logs.")
     ],
     logs: Annotated[
-        list[Path], typer.Argument(help="Logs (.tlog, dataflash .BIN, .ulg; also gzip), or flight records (.mcap).")
+        list[Path], typer.Argument(help="Logs (.tlog, dataflash .BIN, .ulg; also gzip), or flight logs (.mcap).")
     ],
     ranges_from: Annotated[
         list[str] | None,
         typer.Option(
             "--ranges",
-            help="File (CSV, JSON lines, flight record .mcap; repeatable), or synthetic[:KEY=VALUE,...] from truth.",
+            help="File (CSV, JSON lines, flight log .mcap; repeatable), or synthetic[:KEY=VALUE,...] from truth.",
         ),
     ] = None,
     truth: Annotated[
@@ -39,7 +39,7 @@ def replay(
     ] = None,
     drop_gps: Annotated[
         list[str] | None,
-        typer.Option("--drop-gps", help="ID[:FROM,TO]: no fixes of this drone then; repeatable. 2:-90, = last 90 s."),
+        typer.Option("--drop-gps", help="No fixes of this drone then; repeatable. 2:-90, = last 90 s."),
     ] = None,
     loss: Loss = None,
     delay_s: Delay = None,
@@ -61,10 +61,12 @@ def replay(
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results; default: out/replay.")] = None,
     json_file: FiguresFile = None,
 ) -> None:
-    """Replay flights: what would the fleet have known, how sure, and how does it compare.
+    """Replay recorded flights: what would the fleet have known?
+
+    And how sure, and how does it compare?
 
     Times are seconds from the start of the logs, negative from their end. Writes report.html, report.json and the
-    estimates as CSV and MCAP. Flight records of our own daemons are repeated exactly and compared instead.
+    estimates as CSV and MCAP. Flight logs of our own daemons are repeated exactly and compared instead.
     """
     from fleetloc.report.replay_exports import exporting
     from fleetloc.run.replay_run import clear, refuse_inputs, run_replay
@@ -126,8 +128,8 @@ def _repeat(
 
     refuse_mixture(logs)
     if refused:
-        expected = "no such option: a flight record is repeated with what was received (replay its .tlog instead)"
-        raise InputError(", ".join(refused), "", expected, "logs that are flight records (.mcap)")
+        expected = "no such option: a flight log is repeated with what was received (replay its .tlog instead)"
+        raise InputError(", ".join(refused), "", expected, "logs that are flight logs (.mcap)")
     announce()
     warm_up_everything()
     equal = replay_records(config, logs, settings, folder, json_file)
@@ -142,7 +144,10 @@ def ranges(
     ] = 0.5,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
-    """Bias, noise and outliers of measured ranges against true distances, per pair of drones."""
+    """Bias, noise and outliers of ranges, per pair of drones.
+
+    The file holds the true distances beside the measured ones.
+    """
     from fleetloc.report.range_study import study_ranges
 
     study_ranges(file, outlier_m, json_file)

@@ -28,7 +28,10 @@ def report(
         float, typer.Option("--wait", help="Wait at most so many seconds for a run that ends after this began.")
     ] = 0.0,
 ) -> None:
-    """Make report.json and report.html of a finished run, as `fleetloc fleet` does at its end."""
+    """Make the report of a finished run.
+
+    It writes report.json and report.html, as `fleetloc fleet` does at its end.
+    """
     from agent.config.reading import load_config
     from fleetloc.errors import InputError
     from fleetloc.report.fleet_report import write_report

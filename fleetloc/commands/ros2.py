@@ -27,9 +27,10 @@ def ros2(
     frame: Annotated[str, typer.Option("--frame", help="Name of the fleet's frame, east-north-up.")] = "map",
     duration_s: Annotated[float | None, typer.Option("--duration", help="End after so many seconds.")] = None,
 ) -> None:
-    """Publish every drone's estimate as nav_msgs/Odometry to a Zenoh router of ROS 2 (rmw_zenoh), until Ctrl-C.
+    """Publish every drone's estimate to ROS 2, until Ctrl-C.
 
-    It listens to the fleet as a monitor does. Checked for bytes only, not against a running ROS graph.
+    It goes to a Zenoh router of ROS 2 (rmw_zenoh) as nav_msgs/Odometry. The command listens to the fleet as a monitor
+    does. Checked for bytes only, not against a running ROS graph.
     """
     import asyncio
 

@@ -26,7 +26,10 @@ def sim(
         bool, typer.Option("--truth-lines", hidden=True, help="Write the truth to stdout as it happens.")
     ] = False,
 ) -> None:
-    """Fly the fleet of [sim] in real time and serve its autopilots and UWB modules; SIGTERM and SIGINT end it too."""
+    """Fly the world of [sim] in real time, for daemons of yours.
+
+    It serves the autopilots and UWB modules. SIGTERM and SIGINT end it too.
+    """
     import asyncio
     import dataclasses
 

@@ -35,7 +35,7 @@ def sitl(
     ] = None,
     drop_gps: Annotated[
         list[str] | None,
-        typer.Option("--drop-gps", help="ID[:FROM,TO]: no GPS for this daemon, s from the begin; may be repeated."),
+        typer.Option("--drop-gps", help="No GPS for this daemon then, s from the begin; may be repeated."),
     ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the ranges and of injected faults.")] = None,
     loss: Loss = None,
@@ -45,9 +45,10 @@ def sitl(
     profiles: Profiles = None,
     overrides: Overrides = None,
 ) -> None:
-    """Attach a daemon to each running simulator, range by its ground truth, fly a mission if asked, and report.
+    """Attach daemons to running SITL simulators, and report.
 
-    The simulators are started by you (docs/sitl.md). Ends on Ctrl-C too; the report is written in either case.
+    You start the simulators (docs/sitl.md). Ranges are made of their ground truth; a mission is flown if asked. Ends
+    on Ctrl-C too; the report is written in either case.
     """
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files

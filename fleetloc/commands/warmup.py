@@ -11,7 +11,7 @@ def register(app: typer.Typer) -> None:
 
 
 def warmup() -> None:
-    """Compile all numerical kernels into the cache, so that no later start has to.
+    """Compile the numerical kernels, so that no later start has to.
 
     The cache is FLEETLOC_CACHE (default: fleetloc in the user's cache folder); FLEETLOC_CPU says for which
     processor (default generic: any of this architecture).

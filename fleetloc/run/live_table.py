@@ -121,7 +121,7 @@ def lines(title: str, picture: list[Row]) -> list[str]:
     """The picture for a log."""
     return [title] + [
         f"  drone {row.agent_id}: {row.status}; error {row.error or '?'} m, sigma {row.sigma or '?'} m; "
-        f"GPS {row.gps or '?'}; hears {row.neighbours or '?'}; tick {row.tick or '?'} ms; "
-        f"packets {row.packets or '?'}"
+        f"GPS {row.gps or '?'}; hears {row.neighbours or '?'}; tick p50/p99 {row.tick or '?'} ms; "
+        f"packets rx/lost/bad {row.packets or '?'}"
         for row in picture
     ]

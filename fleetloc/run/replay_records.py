@@ -1,4 +1,4 @@
-"""``fleetloc replay`` of our own flight records (.mcap with a .tlog beside it): the same run again, tick by tick."""
+"""``fleetloc replay`` of our own flight logs (.mcap with a .tlog beside it): the same run again, tick by tick."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ FIGURES = "report.json"
 def replay_records(
     config: Path, records: Sequence[Path], overrides: Sequence[Override], folder: Path, json_file: Path | None
 ) -> bool:
-    """Repeat the runs of flight records and compare every estimate with the recorded one; whether all are equal.
+    """Repeat the runs of flight logs and compare every estimate with the recorded one; whether all are equal.
 
     Writes the estimates made again as ``agent_001.again.mcap`` (``A-agent_001.again.mcap`` where only their folders
     tell records apart) and the comparison as ``report.json``. Another configuration or ``overrides`` (``key=value``)
@@ -56,10 +56,10 @@ def replay_records(
 
 
 def refuse_mixture(logs: Sequence[Path]) -> None:
-    """Flight records are replayed alone: they hold packets and ranges too. Raises `InputError`."""
+    """Flight logs are replayed alone: they hold packets and ranges too. Raises `InputError`."""
     others = [path.name for path in logs if path.suffix != ".mcap"]
     if others:
-        raise InputError("logs", "", "flight records (.mcap) or logs, not both", f"also {', '.join(others)}")
+        raise InputError("logs", "", "flight logs (.mcap) or logs, not both", f"also {', '.join(others)}")
 
 
 def _config(config: Path, record: Path, overrides: Sequence[Override]) -> FleetConfig | None:

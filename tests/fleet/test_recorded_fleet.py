@@ -1,4 +1,4 @@
-"""The flight records of a live fleet, repeated: what was estimated in flight comes out again."""
+"""The flight logs of a live fleet, repeated: what was estimated in flight comes out again."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The ranges in a daemon's flight record (.mcap): the ``uwb-range/1`` frames that its own module sent."""
+"""The ranges in a daemon's flight log (.mcap): the ``uwb-range/1`` frames that its own module sent."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from transport.messages.uwb_body import decode_uwb
 
 
 def ranges_of_record(path: Path, counts: RangeCounts) -> Iterator[RangeLine]:
-    """The ranges of a flight record on Unix time; frames that cannot be read are counted.
+    """The ranges of a flight log on Unix time; frames that cannot be read are counted.
 
     A frame without a stamp of its own has the time of its arrival. Raises `LogFileError` for a file that is no
-    flight record.
+    flight log.
     """
     return in_order(_lines(path, counts), counts)
 

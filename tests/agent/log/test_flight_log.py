@@ -1,4 +1,4 @@
-"""Flight records: what went in comes out, however the files end; and a disk that fails never stops anything."""
+"""Flight logs: what went in comes out, however the files end; and a disk that fails never stops anything."""
 
 from __future__ import annotations
 
@@ -244,7 +244,7 @@ def test_what_is_no_flight_record_is_refused_in_one_line(tmp_path: Path, config:
         FlightReader(path)
     for content in (b"", b"text\n" * 100):
         path.write_bytes(content)
-        with pytest.raises(LogFileError, match=r"a\.mcap: expected a flight record \(MCAP\)"):
+        with pytest.raises(LogFileError, match=r"a\.mcap: expected a flight log \(MCAP\)"):
             FlightReader(path)
     EstimateMcap(path, config.ids, 0.1, 0.0).close()
     with pytest.raises(LogFileError, match=r"found MCAP without metadata 'fleetloc\.start'"):

@@ -159,6 +159,16 @@ def test_every_command_has_the_same_help(command: list[str], capsys: pytest.Capt
         assert option in text
     assert not re.search(r"<(?!fleet>)\w+(\[\w+\])?>", text)
     assert "{" not in text.splitlines()[0]
+    # what stands for a value says what kind of thing it is
+    assert " TEXT " not in text
+
+
+@pytest.mark.parametrize("group", [[], ["bench"], ["keys"]], ids=str)
+def test_no_line_of_a_list_of_commands_is_cut_off(group: list[str], capsys: pytest.CaptureFixture[str]) -> None:
+    assert cli.main([*group, "-h"]) == 0
+    listed = capsys.readouterr().out.split("Commands:")[1].splitlines()[1:]
+    assert len(listed) > 5
+    assert not [line for line in listed if line.endswith("...")]
 
 
 def test_help_says_what_a_value_is(capsys: pytest.CaptureFixture[str]) -> None:

@@ -302,7 +302,7 @@ def test_one_range_has_no_spread() -> None:
     assert (figures.bias_m, figures.sigma_m, figures.outliers) == (0.3, 0.0, 0.0)
 
 
-# --- flight records ------------------------------------------------------------------------------------------
+# --- flight logs ------------------------------------------------------------------------------------------
 
 
 @pytest.fixture(scope="module")
@@ -355,7 +355,7 @@ def test_what_cannot_be_asked_of_a_flight_record_is_refused(
 def test_flight_records_and_logs_are_not_mixed(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
     code, _, err = run(capsys, "replay", "recorded", flown / "agent_001.mcap", COPTER)
     assert code == 2
-    assert "flight records (.mcap) or logs, not both" in err
+    assert "flight logs (.mcap) or logs, not both" in err
 
 
 def test_the_ranges_of_a_flight_record_are_read(flown: Path) -> None:

@@ -1,4 +1,4 @@
-"""Flight records repeated: the same estimates, bit by bit, whatever happened in flight."""
+"""Flight logs repeated: the same estimates, bit by bit, whatever happened in flight."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What of the daemons' packets reached whom and how late, out of their flight records (one machine, one clock)."""
+"""What of the daemons' packets reached whom and how late, out of their flight logs (one machine, one clock)."""
 
 from __future__ import annotations
 

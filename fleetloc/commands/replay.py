@@ -41,6 +41,10 @@ def replay(
         list[str] | None,
         typer.Option("--drop-gps", help="No fixes of this drone then; repeatable. 2:-90, = last 90 s."),
     ] = None,
+    fault: Annotated[
+        list[str] | None,
+        typer.Option("--fault", metavar="KEYS", help='Like one of sim.faults: kind="gps_off", agents=[2].'),
+    ] = None,
     loss: Loss = None,
     delay_s: Delay = None,
     estimator: Annotated[
@@ -85,8 +89,8 @@ def replay(
     settings = with_options(options, overrides)
     folder = out or Path("out") / "replay"
     if any(path.suffix == ".mcap" for path in logs):
-        given = {"--ranges": ranges_from, "--truth": truth_given, "--drop-gps": drop_gps, "--loss": loss,
-                 "--delay": delay_s, "--from": from_s, "--to": to_s, "--seed": seed,
+        given = {"--ranges": ranges_from, "--truth": truth_given, "--drop-gps": drop_gps, "--fault": fault,
+                 "--loss": loss, "--delay": delay_s, "--from": from_s, "--to": to_s, "--seed": seed,
                  "--arrival": None if arrival == "logged" else arrival}  # fmt: skip
         refused = [name for name, value in given.items() if value is not None]
         _repeat(config, logs, refused, settings, folder, json_file)
@@ -100,6 +104,7 @@ def replay(
             ranges=ranges_from or (),
             truth=truth,
             drops=drop_gps or (),
+            faults=fault or (),
             seed=1 if seed is None else seed,
             from_s=from_s,
             to_s=to_s,

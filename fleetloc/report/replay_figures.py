@@ -59,7 +59,7 @@ def load_results(prepared: Prepared, directory: Path) -> ReplayResults:
 
 
 def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
-    """The parts of one agent's run; that of a drop of GPS is given for every agent."""
+    """The parts of one agent's run; that of a drop of GPS or a fault is given for every agent."""
     inputs = prepared.inputs
     begin_s = inputs.from_s if first_s is None else first_s
     phases = [Phase(ALL, begin_s, inputs.to_s), Phase(SETTLED, begin_s + SETTLED_S, inputs.to_s)]
@@ -68,6 +68,10 @@ def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
             zero_s = inputs.plan.start_s
             name = f"gps of {agent_id} dropped {from_s - zero_s:.0f}..{to_s - zero_s:.0f} s"
             phases.append(Phase(name, max(from_s, begin_s), to_s))
+    for fault in inputs.injection.faults:
+        from_s, to_s = inputs.plan.start_s + fault.from_s, min(inputs.plan.start_s + fault.end_s, inputs.to_s)
+        name = f"{fault.__struct_config__.tag} {fault.from_s:.0f}..{to_s - inputs.plan.start_s:.0f} s"
+        phases.append(Phase(name, max(from_s, begin_s), to_s))
     return phases
 
 
@@ -99,6 +103,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResult
             for agent_id, windows in inputs.drops.windows.items()
             for from_s, to_s in windows
         ],
+        "faults": inputs.injection.described(),
         "agents": agents,
         "fleet": {
             "engine_wall_s": replayed.wall_s,

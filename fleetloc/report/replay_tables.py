@@ -72,6 +72,9 @@ def cautions(figures: dict[str, Any]) -> list[str]:
         if 0 < agent["ticks_with_truth"] < MOSTLY * estimated:
             known = f"{agent['ticks_with_truth']} of its {estimated} estimates"
             sentences.append(f"errors of drone {agent['id']} are of {known}: there is no truth for the others")
+    if figures["faults"]:
+        kinds = ", ".join(fault["kind"] for fault in figures["faults"])
+        sentences.append(f"faults were injected ({kinds}): this is not what the fleet flew")
     if figures["fleet"]["silences_left_out"]:
         sentences.append(f"{figures['fleet']['silences_left_out']} long silence(s) of the logs were left out")
     return sentences

@@ -16,6 +16,7 @@ from agent.log.estimate_mcap import SUFFIX as RECORD_SUFFIX
 from agent.sensing.frames import FleetFrame
 from fleetloc.errors import InputError
 from sim_bridge.replay.feed import Inputs
+from sim_bridge.replay.injection import Injection, parsed_faults
 from sim_bridge.replay.logs.events import LogSource, TruthSample
 from sim_bridge.replay.logs.opening import open_log
 from sim_bridge.replay.naming import names_apart
@@ -53,6 +54,7 @@ class Options:
     """Files, or one word: synthetic, with its settings."""
     truth: Sequence[str] = (AUTO,)
     drops: Sequence[str] = ()
+    faults: Sequence[str] = ()
     seed: int = 1
     from_s: float | None = None
     to_s: float | None = None
@@ -96,6 +98,8 @@ def prepare(options: Options) -> Prepared:
     flown = tuple(vehicle.agent_id for vehicle in plan.vehicles)
     asked = [GpsDrop.parsed(text) for text in options.drops]
     drops = GpsDrops(asked, flown, plan.start_s, plan.end_s, (from_s, to_s))
+    part_s = from_s - plan.start_s, to_s - plan.start_s
+    injection = Injection(parsed_faults(options.faults, config, flown, part_s), options.seed, plan.start_s)
     truth = {v.agent_id: _fleet_timed(v, files[_key(v)], plan) for v in plan.vehicles} if files else None
     counts = RangeCounts()
     ranges, ranges_from = _ranges(options, config, plan, counts)
@@ -112,6 +116,7 @@ def prepare(options: Options) -> Prepared:
             at_stamps=options.arrival == STAMPED,
             range_counts=counts,
             truth_skipped={agent_id: file.skipped for agent_id, file in truth_files.items()},
+            injection=injection,
         ),
         sources=tuple(sources),
         seed=options.seed,

@@ -16,6 +16,7 @@ from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
 from agent.onboard import OnboardAgent
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
+from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.replay.feed import Arrival, Feed, Heard
 from sim_bridge.replay.side_files.range_files import RangeLine
 from sim_bridge.virtual.event_queue import EventQueue
@@ -72,6 +73,9 @@ class Replay:
             for agent_id in agents
         }
         """By agent; for what is to be known of them after the run. Their monotonic clock is fleet time."""
+        injection = inputs.injection
+        for drone in self.drones.values():
+            corrupt(drone.agent, config, Identity(), injection.faults, epoch_s + injection.start_s)
         self._fleet = VirtualFleet(config, self._queue, on_estimate, unix_offset_s=epoch_s)
         self._period_s = config.fleet.period_s
         self._ahead_s = AHEAD_OF_STAMPS_S if inputs.at_stamps else AHEAD_S

@@ -1,8 +1,8 @@
 """What the agents of a replay hear, in order of arrival, and what becomes of all else that was recorded.
 
-Logs, files of truth and files of ranges are merged here, ranges are made of the truth here, fixes are left out here,
-and what estimates will be compared with goes to disk from here. Nothing of it depends on the agents: a process beside
-theirs may do it (`sim_bridge.replay.reading`).
+Logs, files of truth and files of ranges are merged here, ranges are made of the truth here, fixes are left out and
+faults injected here, and what estimates will be compared with goes to disk from here. Nothing of it depends on the
+agents: a process beside theirs may do it (`sim_bridge.replay.reading`).
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from operator import itemgetter
 from typing import Any, Protocol
 
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from sim_bridge.replay.injection import Injection
 from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
 from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine
@@ -62,6 +63,7 @@ class Inputs:
     at_stamps: bool = False
     range_counts: RangeCounts = field(default_factory=RangeCounts)
     truth_skipped: Mapping[int, Counter[str]] = field(default_factory=dict)
+    injection: Injection = field(default_factory=Injection)
 
     @property
     def synthesiser(self) -> Synthesiser | None:
@@ -133,19 +135,24 @@ class Feed:
 
     def _heard(self, now_s: float, agent_id: int, content: LogSample | RangeLine) -> Iterable[Heard]:
         """What agents hear of one thing that was recorded."""
+        injection = self.inputs.injection
         if isinstance(content, TruthSample):
             self.references.on_reference(agent_id, content, now_s)
             maker = self.inputs.synthesiser
-            return () if maker is None else maker.on_truth(agent_id, content)
+            return () if maker is None else map(injection.range, maker.on_truth(agent_id, content))
         if isinstance(content, AutopilotEstimate):
             self.references.on_reference(agent_id, content, now_s)
             return ()
         if isinstance(content, GpsSample):
-            self.references.on_reference(agent_id, content, now_s)
-            if self.inputs.drops.holds(agent_id, content.t_s):
+            fix = injection.fix(agent_id, content)
+            self.references.on_reference(agent_id, fix or content, now_s)
+            if fix is None or self.inputs.drops.holds(agent_id, content.t_s):
                 self.dropped[agent_id] += 1
                 return ()
-        return (content,)
+            return (fix,)
+        if isinstance(content, ImuSample):
+            return (injection.acceleration(agent_id, content),)
+        return (injection.range(content) if isinstance(content, RangeLine) else content,)
 
     def _merged(self) -> Generator[tuple[float, int, Any], None, None]:
         """Everything in order of arrival."""

@@ -138,6 +138,27 @@ def test_times_count_from_the_start_of_the_logs_whatever_part_is_replayed(tmp_pa
     assert all(log["used"]["1"]["imu"] > 100 for log in figures["logs"])
 
 
+def test_a_fault_is_injected_told_and_judged_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # GIVEN a recorded flight, and its last seconds with a receiver that is 50 m off
+    jump = 'kind="gps_wrong", agents=[1], from_s=3, offset_m=[50, 0, 0]'
+    arguments = ["replay", pair_config(tmp_path), COPTER, COPTER, "--fault", jump, "--out", tmp_path / "out"]
+    code, out, _ = run(capsys, *arguments)
+    # THEN the report says that this is not what was flown, and gives the errors of that part apart
+    assert code == 0
+    assert "faults were injected (gps_wrong)" in out
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    (fault,) = figures["faults"]
+    assert (fault["kind"], fault["agents"], fault["offset_m"]) == ("gps_wrong", [1], [50.0, 0.0, 0.0])
+    received = [
+        next(phase for name, phase in agent["phases"].items() if name.startswith("gps_wrong 3.."))
+        for agent in figures["agents"]
+    ]
+    errors_m = [phase["gps_as_received_horizontal_rmse_m"] for phase in received]
+    assert errors_m[0] == pytest.approx(50.0, abs=3.0)
+    assert errors_m[1] < 3.0
+    assert "faults were injected (gps_wrong)" in (tmp_path / "out" / "report.html").read_text()
+
+
 def _killed(*_arguments: object) -> None:
     os._exit(9)
 
@@ -198,6 +219,7 @@ def _flipped(raw: bytes, share: float) -> bytes:
         (b"hello world, this is no log\n" * 40, (), "expected a flight log"),
         (None, ("--drop-gps", "7"), "--drop-gps: expected a drone with a log (1)"),
         (None, ("--drop-gps", "1:x"), "--drop-gps: expected ID"),
+        (None, ("--fault", 'kind="gps_off", agents=[7]'), "--fault: agents: expected ids of agents"),
         (None, ("--from", "1e6"), "--from/--to"),
         (None, ("--ranges", "synthetic:sigma=1"), "--ranges synthetic: expected"),
         (None, ("--arrival", "never"), "--arrival: expected logged or stamped"),
@@ -342,7 +364,14 @@ def test_a_flight_record_answers_what_another_estimator_would_have_said(
 
 @pytest.mark.parametrize(
     "option",
-    [("--drop-gps", "1"), ("--loss", "0.9"), ("--from", "1"), ("--ranges", "x.csv"), ("--arrival", "stamped")],
+    [
+        ("--drop-gps", "1"),
+        ("--fault", 'kind="gps_off", agents=[1]'),
+        ("--loss", "0.9"),
+        ("--from", "1"),
+        ("--ranges", "x.csv"),
+        ("--arrival", "stamped"),
+    ],
 )
 def test_what_cannot_be_asked_of_a_flight_record_is_refused(
     flown: Path, capsys: pytest.CaptureFixture[str], option: tuple[str, str]

@@ -18,8 +18,10 @@ from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Triple
 from estimators.factory import make_estimator
 from estimators.model.layout import Layout, position
+from sim_bridge.faults.fault_tables import FaultTable
 from sim_bridge.replay.engine import Replay, ReplayCounts
 from sim_bridge.replay.feed import Feed, Inputs
+from sim_bridge.replay.injection import Injection
 from sim_bridge.replay.logs.events import (
     Format,
     LogCounts,
@@ -133,6 +135,7 @@ class Run:
         from_s: float = 0.0,
         to_s: float = math.inf,
         at_stamps: bool = False,
+        faults: tuple[FaultTable, ...] = (),
     ) -> None:
         self.estimates: dict[int, list[EstimateReady]] = {}
         self.references: dict[int, list[object]] = {}
@@ -145,7 +148,8 @@ class Run:
         if source is None and synthetic:
             source = Synthesiser({i: config.neighbours(i) for i in config.ids}, SyntheticNoise(), 1)
         end_s = min(plan.end_s, plan.start_s + to_s)
-        inputs = Inputs(plan, windows, plan.start_s + from_s, end_s, None, source, at_stamps)
+        injection = Injection(faults, 1, plan.start_s)
+        inputs = Inputs(plan, windows, plan.start_s + from_s, end_s, None, source, at_stamps, injection=injection)
         self.layout = Layout(config.ids)
         self.closed = 0
         self.replay = Replay(config, Feed(inputs, self), make_estimator, self.on_estimate)

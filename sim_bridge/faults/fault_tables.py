@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 
@@ -108,7 +108,9 @@ class MemberWrong(_OfAgents, frozen=True, kw_only=True, tag_field="kind", tag="m
     """
 
     offset_m: Point
-    """NED, of its own fixes and of all positions in what it believes."""
+    """NED, of its own fixes and of positions in what it believes."""
+    lies_about: Literal["fleet", "itself"] = "fleet"
+    """Which positions: those of all drones, or its own."""
     variance_divisor: Positive = 100.0
     """Covariances that it sends are its own over this."""
 

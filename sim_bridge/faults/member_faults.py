@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.onboard import OnboardAgent
@@ -96,13 +97,13 @@ def _wrong(message: Message, fault: MemberWrong, own_id: int) -> Message:
         case Measurements():
             return replace(message, records=tuple(_shifted(each, fault, own_id) for each in message.records))
         case Information():
-            mean = np.linalg.solve(message.information, message.vector) + _offset(fault, len(message.agents))
+            mean = np.linalg.solve(message.information, message.vector) + _offset(fault, message.agents, own_id)
             information = fault.variance_divisor * message.information
             return replace(message, information=information, vector=information @ mean)
         case FleetEstimate():
             return replace(
                 message,
-                mean=message.mean + _offset(fault, len(message.agents)),
+                mean=message.mean + _offset(fault, message.agents, own_id),
                 variance=message.variance / fault.variance_divisor,
                 own_covariance=message.own_covariance / fault.variance_divisor,
             )
@@ -117,6 +118,8 @@ def _shifted(record: Measurement, fault: MemberWrong, own_id: int) -> Measuremen
     return replace(record, position_m=(north, east, down))
 
 
-def _offset(fault: MemberWrong, agents: int) -> np.ndarray[tuple[int], np.dtype[np.float64]]:
-    """Of a state of so many agents: all positions alike."""
-    return np.tile(np.concatenate((fault.offset_m, np.zeros(STATES_PER_AGENT - 3))), agents)
+def _offset(fault: MemberWrong, agents: tuple[int, ...], own_id: int) -> NDArray[np.float64]:
+    """Of a state of these agents ``(6n,)``: the positions that the lie is about, all alike."""
+    offset = np.zeros((len(agents), STATES_PER_AGENT))
+    offset[[fault.lies_about == "fleet" or agent_id == own_id for agent_id in agents], :3] = fault.offset_m
+    return offset.ravel()

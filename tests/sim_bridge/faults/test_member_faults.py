@@ -112,6 +112,16 @@ def test_a_liars_pairs_are_off_and_too_sure():
     assert (told.tick, told.state_tick, told.rank) == (honest.tick, honest.state_tick, honest.rank)
 
 
+def test_a_liar_about_itself_leaves_the_others_where_it_believes_them():
+    honest = information(1020)
+    about_itself = MemberWrong(agents=(2,), offset_m=OFFSET_M, lies_about="itself", variance_divisor=25.0)
+    told = Member(about_itself).said(honest, FROM_S)
+    moved = (mean_of(told) - mean_of(honest)).reshape(3, 6)
+    np.testing.assert_allclose(moved[1, :3], OFFSET_M, atol=1e-6)
+    np.testing.assert_allclose(np.delete(moved, slice(6, 9)), 0.0, atol=1e-6)
+    np.testing.assert_allclose(told.information, 25.0 * honest.information, rtol=1e-12)
+
+
 def test_a_liars_estimate_is_off_and_too_sure():
     honest = FleetEstimate(1020, 0, ROSTER, np.arange(18.0), np.full(18, 4.0), (0, 0, 1), 4.0 * np.eye(6))
     told = Member(LIE).said(honest, FROM_S)

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 import re
 from enum import StrEnum
+from functools import lru_cache
 
 from transport.errors import SettingsError
 
 PREFIX = "cl/v1"
 MIN_AGENT_ID, MAX_AGENT_ID = 1, 999
+KEYS_KNOWN_AGAIN = 512
+"""How many keys are known again once they were parsed: packets come under the same few."""
 
 _FLEET_NAME = re.compile(r"[a-z0-9_-]{1,32}")
 _KEY = re.compile(rf"{PREFIX}/([a-z0-9_-]{{1,32}})/agent/([0-9]{{3}})/([a-z]+)")
@@ -80,6 +83,7 @@ def presence_pattern(fleet: str) -> str:
     return f"{PREFIX}/{check_fleet_name(fleet)}/agent/*/{Stream.ALIVE.value}"
 
 
+@lru_cache(KEYS_KNOWN_AGAIN)
 def parse_key(key: str) -> tuple[str, int, Stream] | None:
     """Fleet, agent id and stream of a key; ``None`` if it is not one of ours."""
     match = _KEY.fullmatch(key)

@@ -31,6 +31,8 @@ MAX_MAGNITUDE = 1e18
 """Largest entry of an information pair: beyond it, arithmetic with the pair loses all meaning."""
 MAX_CONDITION_FOR_FLOAT32 = 1e6
 """A float32 pair moves the mean by about 6e-8 times the condition number, relatively."""
+CONTENTS_KNOWN_AGAIN = 32
+"""How many contents that were checked are known again: in virtual time those who hear a pair are in one process."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -145,29 +147,44 @@ def decode_content(
 
     ``part`` is any of the parts; they agree on everything but index and share.
     """
-    n, dimension = part.agents, STATES_PER_AGENT * part.agents
-    ids = tuple(int(agent_id) for agent_id in np.frombuffer(content, "<u2", n))
-    if len(set(ids)) != n or not all(agent_id in roster for agent_id in ids):
+    ids, numbers = _checked(content, part.agents, part.double)
+    if not all(agent_id in roster for agent_id in ids):
         raise Rejected(Reason.UNKNOWN_AGENT, f"pair of agents {ids}")
-    number = np.dtype("<f8" if part.double else "<f4")
+    dimension = STATES_PER_AGENT * part.agents
+    information, vector = numbers[_places(dimension)], numbers[:dimension].copy()
+    return Information(tick, round_, part.state_tick, part.rank, ids, information, vector)
+
+
+@lru_cache(CONTENTS_KNOWN_AGAIN)
+def _checked(content: bytes, agents: int, double: bool) -> tuple[tuple[int, ...], Vector]:
+    """Ids and numbers of a content, whose matrix is definite; the numbers are shared, and to be copied."""
+    dimension = STATES_PER_AGENT * agents
+    ids = tuple(np.frombuffer(content, "<u2", agents).tolist())
+    if len(set(ids)) != agents:
+        raise Rejected(Reason.UNKNOWN_AGENT, f"pair of agents {ids}")
+    number = np.dtype("<f8" if double else "<f4")
     with np.errstate(invalid="ignore"):  # a signalling NaN may not warn before it is refused
-        numbers = np.frombuffer(content, number, offset=2 * n).astype(np.float64)
+        numbers = np.frombuffer(content, number, offset=2 * agents).astype(np.float64)
     if not np.isfinite(numbers).all():
         raise Rejected(Reason.NOT_FINITE, "information pair")
     if (np.abs(numbers) > MAX_MAGNITUDE).any():
         raise Rejected(Reason.OUT_OF_RANGE, f"information pair beyond {MAX_MAGNITUDE:g}")
-    information = np.zeros((dimension, dimension))
-    information[_triangle(dimension)] = numbers[dimension:]
-    information += np.triu(information, 1).T
-    if not _is_definite(information):
+    if not _is_definite(numbers[_places(dimension)]):
         raise Rejected(Reason.NOT_POSITIVE_DEFINITE, "information matrix")
-    vector = numbers[:dimension]
-    return Information(tick, round_, part.state_tick, part.rank, ids, information, vector)
+    return ids, numbers
 
 
 @lru_cache(maxsize=8)
 def _triangle(dimension: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
     return np.triu_indices(dimension)
+
+
+@lru_cache(maxsize=8)
+def _places(dimension: int) -> NDArray[np.intp]:
+    """Where each entry of the symmetric matrix stands among a content's numbers, behind the vector."""
+    places = np.zeros((dimension, dimension), np.intp)
+    places[_triangle(dimension)] = np.arange(dimension, dimension + dimension * (dimension + 1) // 2)
+    return np.maximum(places, places.T)
 
 
 def _is_definite(matrix: Matrix) -> bool:

@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Collection
+from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 from enum import IntEnum
 from functools import cached_property, lru_cache
@@ -38,6 +38,8 @@ MAX_RANGE_M = 1e5
 MAX_ACCEL_MPS2 = 1e4
 RECORDS_KNOWN_AGAIN = 4096
 """How many decoded records are known again by their bytes: more than a fleet of ten sends anew in its history."""
+BODIES_KNOWN_AGAIN = 128
+"""The same of whole bodies: in virtual time those who hear a packet are in one process, and decode it once."""
 
 
 class MeasurementKind(IntEnum):
@@ -276,9 +278,18 @@ def encode_measurements(
 
 
 def decode_measurements(
-    body: bytes, *, tick: int, count: int, roster: Collection[int], exchange: int = 0
+    body: bytes, *, tick: int, count: int, roster: AbstractSet[int], exchange: int = 0
 ) -> Measurements:
     """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good."""
+    records, named = _decode_body(body, tick, count)
+    if not named <= roster:
+        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {min(named - roster)}")
+    return Measurements(tick, records, exchange)
+
+
+@lru_cache(BODIES_KNOWN_AGAIN)
+def _decode_body(body: bytes, tick: int, count: int) -> tuple[tuple[Measurement, ...], frozenset[int]]:
+    """The records of a body, and all agents that they name."""
     records: list[Measurement] = []
     at, size = 0, len(body)
     for _ in range(count):
@@ -286,13 +297,14 @@ def decode_measurements(
         if layout is None or at + layout.size > size:
             raise Rejected(Reason.MALFORMED, f"record {len(records)} at byte {at} of {size}")
         age_at, end = at + _AGE_AT, at + layout.size
-        record = _decode_record(body[at:age_at] + b"\0" + body[age_at + 1 : end], tick - body[age_at])
-        _check_known(record, roster)
-        records.append(record)
+        wire = body[at:age_at] + b"\0" + body[age_at + 1 : end]
+        records.append(_decode_record(wire, tick - body[age_at]))
         at = end
     if at != size:
         raise Rejected(Reason.MALFORMED, f"{size - at} bytes after the last record")
-    return Measurements(tick, tuple(records), exchange)
+    named = {record.observer for record in records}
+    named.update(record.other for record in records if isinstance(record, RangeMeasurement))
+    return tuple(records), frozenset(named)
 
 
 # --- one record --------------------------------------------------------------------------------------------
@@ -355,6 +367,12 @@ def _check_place(record: _Record, middle: _Floats) -> None:
 @lru_cache(RECORDS_KNOWN_AGAIN)
 def _decode_record(wire: bytes, tick: int) -> Measurement:
     """A record of its bytes with age 0 and its tick: of all that it says, so that no other is taken for it."""
+    record = _record_from(wire, tick)
+    vars(record)["wire"] = wire  # to encode it anew would give the same
+    return record
+
+
+def _record_from(wire: bytes, tick: int) -> Measurement:
     if tick < 0:
         raise Rejected(Reason.OUT_OF_RANGE, f"record of tick {tick}")
     fields = _LAYOUT[wire[0]].unpack(wire)
@@ -384,14 +402,6 @@ def _decode_record(wire: bytes, tick: int) -> Measurement:
     anchor = _triple(_bounded(fields[4:7], MAX_POSITION_M, "anchor"))
     range_m = _bounded(fields[7:8], MAX_RANGE_M, "range")[0]
     return AnchorRangeMeasurement(observer, tick, anchor, range_m, sigma, half_width, offset)
-
-
-def _check_known(record: Measurement, roster: Collection[int]) -> None:
-    """Whom a record names must be of the fleet."""
-    if record.observer not in roster:
-        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {record.observer}")
-    if isinstance(record, RangeMeasurement) and record.other not in roster:
-        raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {record.other}")
 
 
 def _bounded(values: _Floats, limit: float, what: str) -> _Floats:

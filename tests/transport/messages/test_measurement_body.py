@@ -135,6 +135,7 @@ def test_a_record_of_changed_bytes_is_another_one(record: Measurement, data: st.
         return
     # THEN what comes out says what the changed bytes say, and is the same measurement only by the same name
     assert encode_measurements(received).body == forged
+    assert encode_measurements(Measurements(TICK, (replace(received.records[0]),))).body == forged
     same = received.records[0].identity == known.identity
     assert same == (place >= IDENTITY_ENDS[known.kind])
 

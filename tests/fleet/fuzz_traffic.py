@@ -28,6 +28,8 @@ HEARD = (Stream.MEAS, Stream.INFO)
 UNHEARD = (Stream.EST, Stream.CLOCK, Stream.DIAG)
 CAPTURED_FOR_S = 3.0
 """A captured packet has reached the daemon long before it is sent again."""
+ENOUGH = 30
+"""Captured packets of each source to choose among; every neighbour measures ten times a second."""
 LONG_AGO_S = 1_234_567.0
 """No few flipped bits of a time written in digits make it the present."""
 STRANGER_SYSTEM = 77
@@ -60,19 +62,33 @@ class Captured:
         self._packets: dict[tuple[int, Stream], deque[tuple[float, bytes]]] = {
             source: deque(maxlen=300) for source in itertools.product(NEIGHBOURS, HEARD)
         }
-        self._lock = threading.Lock()
+        self._changed = threading.Condition()
 
     def add(self, agent_id: int, stream: Stream, packet: bytes) -> None:
         """Note a packet that has just come."""
-        with self._lock:
+        with self._changed:
             self._packets[agent_id, stream].append((time.monotonic(), packet))
+            self._changed.notify_all()
+
+    def wait_for_one(self, patience_s: float) -> None:
+        """Until the next packet comes."""
+        with self._changed:
+            assert self._changed.wait(patience_s), f"no packet of the fleet in {patience_s:g} s"
+
+    def enough(self) -> bool:
+        """Whether there are `ENOUGH` of each source that may be sent again."""
+        with self._changed:
+            return all(self._old(kept) >= ENOUGH for kept in self._packets.values())
 
     def pick(self, rng: np.random.Generator, agent_id: int, stream: Stream) -> bytes:
         """One that came more than ``CAPTURED_FOR_S`` ago."""
-        with self._lock:
+        with self._changed:
             kept = self._packets[agent_id, stream]
-            old = len(kept) - sum(1 for _ in itertools.takewhile(self._is_young, reversed(kept)))
-            return kept[int(rng.integers(old))][1]
+            return kept[int(rng.integers(self._old(kept)))][1]
+
+    def _old(self, kept: deque[tuple[float, bytes]]) -> int:
+        """How many at the beginning may be sent again."""
+        return len(kept) - sum(1 for _ in itertools.takewhile(self._is_young, reversed(kept)))
 
     @staticmethod
     def _is_young(entry: tuple[float, bytes]) -> bool:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from tests.fleet.fuzz_daemon import settle_aged
+from tests.fleet.fuzz_verdict import settle_aged
 
 
 def accounts(refused: int, unusable: int, strangers: int) -> dict[str, dict[str, int]]:
@@ -17,21 +17,25 @@ def accounts(refused: int, unusable: int, strangers: int) -> dict[str, dict[str,
 
 
 @pytest.mark.parametrize(
-    ("refused", "unusable", "strangers", "stale", "sound"),
+    ("refused", "unusable", "strangers", "stale", "own", "sound"),
     [
-        (308, 40, 30, 9, True),
-        (313, 37, 28, 14, True),
-        (313, 37, 28, 4, False),  # not refused for their age
-        (313, 40, 30, 14, False),  # five more than were sent
-        (308, 37, 30, 9, False),  # three are gone
-        (307, 41, 30, 9, False),
-        (303, 40, 30, 9, False),
+        (308, 40, 30, 9, 0, True),
+        (313, 37, 28, 14, 0, True),
+        (313, 37, 28, 4, 0, False),  # not refused for their age
+        (313, 40, 30, 14, 0, False),  # five more than were sent
+        (313, 40, 30, 14, 5, True),  # they came from the own module
+        (314, 40, 30, 14, 5, False),
+        (313, 37, 30, 14, 2, True),  # three of the hostile ones and two others
+        (313, 40, 30, 4, 5, False),
+        (308, 37, 30, 9, 9, False),  # three are gone
+        (307, 41, 30, 9, 9, False),
+        (303, 40, 30, 9, 9, False),
     ],
 )
 def test_only_frames_that_grew_stale_are_settled(
-    refused: int, unusable: int, strangers: int, stale: int, sound: bool
+    refused: int, unusable: int, strangers: int, stale: int, own: int, sound: bool
 ) -> None:
     counted = accounts(refused, unusable, strangers)
-    said = settle_aged(counted, stale)
+    said = settle_aged(counted, stale, own)
     assert (said == []) == sound
     assert all(counts["found"] == counts["expected"] for counts in counted.values()) == sound

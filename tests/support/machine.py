@@ -39,9 +39,13 @@ class Witness:
         first, last = (np.searchsorted(self.due_s, begin_s + after_s) for after_s in (-WAKE_PERIOD_S, period_s))
         return np.asarray(so_far_s[last] - so_far_s[first] < MAX_LATE_SHARE * period_s)
 
-    def lost_s(self, begin_s: float, end_s: float) -> float:
-        """What the machine was late by in sum between two UTC seconds: so much more a promise may take."""
-        return float(self.late_s[(self.due_s >= begin_s) & (self.due_s < end_s)].sum())
+    def lost_s(self, begin_s: float, end_s: float, beyond_s: float = 0.0) -> float:
+        """What the machine was late by in sum between two UTC seconds: so much more a promise may take.
+
+        With ``beyond_s``, of the times only at which it was late by more.
+        """
+        inside = (self.due_s >= begin_s) & (self.due_s < end_s) & (self.late_s > beyond_s)
+        return float(self.late_s[inside].sum())
 
 
 @contextmanager

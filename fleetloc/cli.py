@@ -90,7 +90,7 @@ def _exit_code(error: Exception) -> int | None:
 
 def _one_line(error: Exception) -> str:
     if hasattr(error, "format_message"):
-        text = f"{error.format_message()} (see fleetloc --help)"
+        text = f"{error.format_message()} (see {_command_of(error)} --help)"
     elif isinstance(error, OSError) and error.filename is not None and error.strerror:
         text = f"{error.filename}: {error.strerror}"
     elif _exit_code(error) is None:
@@ -98,3 +98,9 @@ def _one_line(error: Exception) -> str:
     else:
         text = str(error)
     return " ".join(text.split())
+
+
+def _command_of(error: Exception) -> str:
+    """The command that was typed, ``fleetloc bench loss``, as far as the option parser got."""
+    context = getattr(error, "ctx", None)
+    return "fleetloc" if context is None else str(context.command_path)

@@ -68,7 +68,7 @@ def check(
 
 
 def _summary(config: Path, fleet: FleetConfig) -> None:
-    typer.echo(f"{config}: fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
+    typer.echo(f"{config}: no mistakes; fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
     for table in fleet.agents:
         hears = ", ".join(map(str, fleet.neighbours(table.id))) or "nobody"
         listens = ", ".join(fleet.listen(table.id))

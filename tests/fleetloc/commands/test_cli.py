@@ -104,7 +104,12 @@ def test_exit_code_of_a_command_is_passed_on(raising: Callable[[BaseException], 
 
 @pytest.mark.parametrize(
     ("arguments", "says"),
-    [(["nonsense"], "nonsense"), (["warmup", "--fast"], "--fast"), (["warmup", "extra"], "extra")],
+    [
+        (["nonsense"], "'nonsense'. (see fleetloc --help)"),
+        (["warmup", "--fast"], "--fast (see fleetloc warmup --help)"),
+        (["warmup", "extra"], "(extra) (see fleetloc warmup --help)"),
+        (["bench", "loss", "--fast"], "--fast (see fleetloc bench loss --help)"),
+    ],
 )
 def test_wrong_usage_is_one_line(
     capsys: pytest.CaptureFixture[str], arguments: list[str], says: str

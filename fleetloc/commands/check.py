@@ -68,7 +68,8 @@ def check(
 
 
 def _summary(config: Path, fleet: FleetConfig) -> None:
-    typer.echo(f"{config}: no mistakes; fleet {fleet.fleet.name}, {1 / fleet.fleet.period_s:g} Hz, {fleet.estimator.kind}")
+    rate_hz = 1 / fleet.fleet.period_s
+    typer.echo(f"{config}: no mistakes; fleet {fleet.fleet.name}, {rate_hz:g} Hz, {fleet.estimator.kind}")
     for table in fleet.agents:
         hears = ", ".join(map(str, fleet.neighbours(table.id))) or "nobody"
         listens = ", ".join(fleet.listen(table.id))

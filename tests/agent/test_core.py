@@ -302,7 +302,7 @@ def test_a_drone_without_gps_lives_on_its_neighbours(make_config: MakeConfig) ->
 def test_a_drone_that_never_had_gps_says_so_until_its_ranges_leave_one_place(
     make_config: MakeConfig
 ) -> None:
-    config = make_config(5, "initial.max_wait_s=2.0", "estimator.kind=dmhe_shared", "estimator.window=4")
+    config = make_config(5, "estimator.kind=dmhe_shared", "estimator.window=4")
     fleet = CirclingFleet(config, blind=lambda agent_id, t_s: agent_id == 5)
     fleet.run(9)
     statuses = [r.estimate.status for r in fleet.estimates[5]]

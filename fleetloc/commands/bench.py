@@ -317,15 +317,16 @@ def speed(
     kinds: Annotated[str, typer.Option(help="Our estimators in it; ratios are to the first.")] = "dmhe_shared",
     ticks: Annotated[int, typer.Option(min=1, help="Timed ticks of its flights, at least.")] = 60,
     rounds: Annotated[int, typer.Option(min=1, help="Times that its flights are gone through.")] = 5,
+    acados: Annotated[str | None, typer.Option(help="Python of an environment that has acados.")] = None,
     json_file: JsonFile = None,
 ) -> None:
     """Time of our step beside other solvers.
 
-    The whole step beside gtsam's smoothers, our window beside IPOPT, SQP+OSQP, SLSQP and plain numpy.
+    The whole step beside gtsam's smoothers, our windows beside acados, IPOPT, SQP+OSQP, SLSQP and plain numpy.
     """
     from fleetloc.bench.speed.environment import use_one_thread
 
     use_one_thread()  # before numpy comes in
     from fleetloc.bench.speed.command import SpeedOptions, run_command
 
-    run_command(SpeedOptions(json_file, seed, repeats, windows, sizes, cases, fleets, kinds, ticks, rounds))
+    run_command(SpeedOptions(json_file, seed, repeats, windows, sizes, cases, fleets, kinds, ticks, rounds, acados))

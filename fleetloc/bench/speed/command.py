@@ -14,6 +14,8 @@ from fleetloc.bench.speed.bounds import CASES
 from fleetloc.bench.speed.fleet import report as fleet_report
 from fleetloc.bench.speed.fleet.flight import parse_fleet
 from fleetloc.bench.speed.fleet.study import FleetPlan, run_fleets
+from fleetloc.bench.speed.joint import report as joint_report
+from fleetloc.bench.speed.joint.study import JointPlan, run_joint
 from fleetloc.bench.speed.peers_casadi import require_casadi
 from fleetloc.bench.speed.report import as_document, show
 from fleetloc.bench.speed.study import SpeedPlan, run_speed
@@ -43,29 +45,32 @@ class SpeedOptions:
     kinds: str
     ticks: int
     rounds: int
+    acados: str | None
 
 
 def run_command(options: SpeedOptions) -> None:
     """Check the options, run the studies, show them; raises `InputError` and `EnvironmentFault`."""
-    plan, fleet_plan = _plans(options)
+    plan, fleet_plan, joint_plan = _plans(options)
     if options.json is not None and options.json.is_dir():
         raise InputError("--json", "", "a file", f"the folder {options.json}")
-    if plan.sizes:
+    if plan.sizes or joint_plan.fleets:
         require_casadi()
     announce()
     errors = Console(stderr=True, highlight=False)
     with errors.status("starting") as status:
         fleets = run_fleets(fleet_plan, status.update)
+        joint = run_joint(joint_plan, status.update)
         results = run_speed(plan, status.update)
     console = Console()
     console.width = max(console.width, TABLE_WIDTH)
     fleet_report.show(console, fleets)
+    joint_report.show(console, joint)
     show(console, results)
     if options.json is not None:
-        write_json(options.json, as_document(plan, results, fleet_plan, fleets))
+        write_json(options.json, as_document(plan, results, fleet_plan, fleets, joint))
 
 
-def _plans(options: SpeedOptions) -> tuple[SpeedPlan, FleetPlan]:
+def _plans(options: SpeedOptions) -> tuple[SpeedPlan, FleetPlan, JointPlan]:
     plan = SpeedPlan(
         seed=options.seed,
         repeats=options.repeats,
@@ -81,7 +86,14 @@ def _plans(options: SpeedOptions) -> tuple[SpeedPlan, FleetPlan]:
         ticks=options.ticks,
         rounds=options.rounds,
     )
-    return plan, fleet_plan
+    joint_plan = JointPlan(
+        seed=options.seed,
+        fleets=fleet_plan.fleets,
+        windows=options.windows,
+        repeats=options.repeats,
+        acados=options.acados,
+    )
+    return plan, fleet_plan, joint_plan
 
 
 def _listed(text: str) -> list[str]:

@@ -14,6 +14,8 @@ from rich.table import Table
 from fleetloc.bench.speed.environment import describe
 from fleetloc.bench.speed.fleet import report as fleet_report
 from fleetloc.bench.speed.fleet.study import FleetPlan, FleetResult
+from fleetloc.bench.speed.joint import report as joint_report
+from fleetloc.bench.speed.joint.study import JointResult
 from fleetloc.bench.speed.study import CaseResult, SizeResult, SpeedPlan
 
 MEANING = {
@@ -24,7 +26,11 @@ MEANING = {
 
 
 def as_document(
-    plan: SpeedPlan, results: Sequence[SizeResult], fleet_plan: FleetPlan, fleets: Sequence[FleetResult]
+    plan: SpeedPlan,
+    results: Sequence[SizeResult],
+    fleet_plan: FleetPlan,
+    fleets: Sequence[FleetResult],
+    joint: Sequence[JointResult],
 ) -> dict[str, Any]:
     """The JSON document; a figure that does not apply is nan."""
     return {
@@ -42,6 +48,7 @@ def as_document(
             "meaning": fleet_report.MEANING,
             "fleets": msgspec.to_builtins(list(fleets)),
         },
+        "joint_windows": {"meaning": joint_report.MEANING, "fleets": msgspec.to_builtins(list(joint))},
     }
 
 

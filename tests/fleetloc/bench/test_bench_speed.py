@@ -173,7 +173,7 @@ def test_methods_agree_where_bounds_are_active(result: SizeResult) -> None:
 @needs_casadi
 def test_document_has_every_figure_and_no_nan(result: SizeResult, tmp_path: Path) -> None:
     target = tmp_path / "speed.json"
-    write_json(target, as_document(SpeedPlan(sizes=(SMALL,)), [result], FleetPlan(), []))
+    write_json(target, as_document(SpeedPlan(sizes=(SMALL,)), [result], FleetPlan(), [], []))
     document = json.loads(target.read_text(), parse_constant=lambda text: pytest.fail(f"{text} in JSON"))
     (size,) = document["sizes"]
     assert (size["agents"], size["window_ticks"], size["regional_agents"]) == (3, 2, 3)
@@ -224,6 +224,18 @@ def test_methods_take_turns_and_slow_ones_play_fewer_rounds() -> None:
         assert {name for name, _ in timed[turn : turn + 2]} == {"fast", "slow"}
         assert timed[turn][1] == timed[turn + 1][1]
     assert {name for name, _ in timed[12:]} == {"fast"}
+
+
+def test_work_of_another_process_counts_what_its_answer_says() -> None:
+    # GIVEN a call that takes 5 s here, waiting for a process that worked 2 s
+    watch = Watch()
+    here = watch.method("here", 1.0, 2)
+    there = replace(watch.method("there", 5.0, 2), elsewhere=lambda answer: 2.0 + answer)
+    # WHEN they take turns
+    timings = time_interleaved([here, there], 2, 100.0, np.random.default_rng(0), watch)
+    # THEN only that work is counted, and the others' is not disturbed
+    assert sorted(timings["there"].cpu_s) == [2.0, 2.0, 3.0, 3.0]
+    assert timings["here"].cpu_s == pytest.approx([1.0] * 4)
 
 
 def test_slowest_method_is_timed_once_at_least() -> None:

@@ -8,7 +8,7 @@ from typing import Any
 from fleetloc.extras import is_installed, sentence
 from fleetloc.report.replay_figures import ReplayResults
 from fleetloc.report.replay_tables import cautions, error_table, log_table
-from fleetloc.report.report_html import CSS
+from fleetloc.report.report_html import CSS, counted
 from fleetloc.report.style import NO_PLOTS, colour
 from fleetloc.run.replay_run import Replayed
 from fleetloc.run.replay_setup import Prepared
@@ -19,6 +19,8 @@ SYNTHETIC = (
 )
 
 
+LONG_CELL, WORDS = 30, ' class="words"'
+"""Characters from which on a cell may be broken into lines."""
 Section = tuple[str, str, str]
 """Heading, a sentence on it, and HTML."""
 
@@ -107,10 +109,11 @@ _AUTOPILOT_NOTE = (
 def _summary(prepared: Prepared, figures: dict[str, Any]) -> str:
     config, fleet = prepared.config, figures["fleet"]
     return (
-        f"{len(figures['agents'])} drone(s), {figures['duration_s']:.0f} s of logs, {fleet['times_real_time']:.1f} "
-        f"times faster than real time; {config.estimator.kind}, window {config.estimator.window}, "
-        f"{config.estimator.rounds} round(s), {1 / config.fleet.period_s:g} Hz; loss {config.transport.loss:g}; "
-        f"delay {config.transport.delay_s:g} s, seed {figures['seed']}. Truth: {figures['truth']}. Ranges: "
+        f"{counted(len(figures['agents']), 'drone')}, {figures['duration_s']:.0f} s of logs, "
+        f"{fleet['times_real_time']:.1f} times faster than real time; {config.estimator.kind}, "
+        f"window {config.estimator.window}, {counted(config.estimator.rounds, 'round')}, "
+        f"{1 / config.fleet.period_s:g} Hz; loss {config.transport.loss:g}, "
+        f"delay {config.transport.delay_s:g} s; seed {figures['seed']}. Truth: {figures['truth']}. Ranges: "
         f"{figures['ranges']}. Clocks: {figures['clocks']}. Origin: {figures['origin']}."
     )
 
@@ -131,5 +134,10 @@ def _warnings(figures: dict[str, Any]) -> str:
 
 def _table(columns: list[str], rows: list[list[str]]) -> str:
     head = "".join(f"<th>{escape(column)}</th>" for column in columns)
-    body = "".join(f"<tr>{''.join(f'<td>{escape(cell)}</td>' for cell in row)}</tr>\n" for row in rows)
+    body = "".join(f"<tr>{''.join(map(_cell, row))}</tr>\n" for row in rows)
     return f"<table>\n<tr>{head}</tr>\n{body}</table>"
+
+
+def _cell(text: str) -> str:
+    """A cell of a table; a short one stays on one line."""
+    return f"<td{WORDS if len(text) > LONG_CELL else ''}>{escape(text)}</td>"

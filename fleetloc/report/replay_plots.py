@@ -21,6 +21,8 @@ OTHERS = ("#999999", "#000000")
 GAP_S = 2.0
 SIGMAS = 3.0
 WINDOWS_PERCENT = 98
+WIDEST_BAND = 10.0
+"""A claim that is larger than the errors by more than this runs out of the picture, where it would flatten them."""
 
 
 class Series:
@@ -166,7 +168,7 @@ def latency(
         )
         axes.plot(when, 1e3 * value, color=colour[agent_id], linewidth=1.0, label=f"drone {agent_id}")
     axes.set(xlim=span_s, xlabel="time s", ylabel="ms")
-    axes.legend(loc="upper right", ncols=4)
+    figure.legend(loc="outside lower center", ncols=8)
     return figure
 
 
@@ -176,7 +178,11 @@ def _shade(axes: Axes, windows: Windows) -> None:
 
 
 def _limits(error: Floats, sigma: Floats) -> tuple[float, float]:
-    """Nearly all of it; a wild start runs out of the picture."""
+    """Nearly all of it; a wild start runs out of the picture, and so does a band that hides the error."""
+    known = np.abs(error[np.isfinite(error)])
     reach = np.maximum(np.abs(np.nan_to_num(error)), SIGMAS * sigma)
-    limit = 1.15 * float(np.percentile(reach, WINDOWS_PERCENT)) if len(reach) else 1.0
-    return -limit, limit
+    limit = float(np.percentile(reach, WINDOWS_PERCENT)) if len(reach) else 1.0
+    widest = WIDEST_BAND * float(np.percentile(known, WINDOWS_PERCENT)) if len(known) else 0.0
+    if widest > 0.0:
+        limit = min(limit, widest)
+    return -1.15 * limit, 1.15 * limit

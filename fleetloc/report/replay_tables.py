@@ -6,6 +6,7 @@ from typing import Any
 
 from fleetloc.report.replay_figures import ALL, SETTLED
 
+SPELLED = {SETTLED: "after 10 s"}
 MOSTLY = 0.9
 """Share of the estimates with a truth below which a reader is told."""
 
@@ -45,9 +46,11 @@ def error_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
         for name, phase in agent["phases"].items():
             if name == ALL and phase["ticks_with_truth"] == agent["phases"][SETTLED]["ticks_with_truth"] != 0:
                 continue
+            if name == SETTLED and not phase["ticks_with_truth"] and agent["phases"][ALL]["ticks_with_truth"]:
+                continue  # it ended before
             rows.append(
                 [
-                    f"{agent['id']} {name}",
+                    f"{agent['id']}, {SPELLED.get(name, name)}",
                     *(
                         shown(phase[key])
                         for key in ("position_rmse_m", "horizontal_rmse_m", "position_median_m", "position_p95_m")

@@ -21,9 +21,10 @@ body { font: 15px/1.45 system-ui, sans-serif; color: #1b1b1b; background: #fff; 
 h1 { font-size: 1.5em; margin-bottom: 0.2em; } h2 { font-size: 1.15em; margin: 1.8em 0 0.2em; }
 p.note { color: #555; margin: 0.2em 0 0.6em; } svg { width: 100%; height: auto; }
 table { border-collapse: collapse; font-size: 0.92em; margin: 0.6em 0; }
-th, td { padding: 0.25em 0.8em; text-align: right; border-bottom: 1px solid #ddd; } th { color: #444; }
+th, td { padding: 0.25em 0.8em; text-align: right; border-bottom: 1px solid #ddd; }
+th { color: #444; vertical-align: bottom; } td { white-space: nowrap; } td.words { white-space: normal; }
 th:first-child, td:first-child { text-align: left; } tr.total td { font-weight: 600; border-top: 1px solid #888; }
-.warning { background: #fff3d6; padding: 0.5em 0.8em; border-left: 4px solid #e69f00; }
+.warning { background: #fff3d6; padding: 0.5em 0.8em; border-left: 4px solid #e69f00; margin: 0.3em 0; }
 """
 
 COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
@@ -81,10 +82,10 @@ def _summary(config: FleetConfig, figures: dict[str, Any]) -> str:
     if figures["mode"] == "lockstep":
         how = f"in virtual time, {figures['fleet']['times_real_time']:.1f} times faster than real time"
     return (
-        f"{len(config.agents)} drones, {figures['duration_s']:.0f} s {how}; {config.estimator.kind}, window "
-        f"{config.estimator.window}, {config.estimator.rounds} round(s), {1 / config.fleet.period_s:g} Hz; world "
-        f"'{sim_table(config).profile}', seed {figures['seed']}; loss {config.transport.loss:g}, delay "
-        f"{config.transport.delay_s:g} s"
+        f"{counted(len(config.agents), 'drone')}, {figures['duration_s']:.0f} s {how}; {config.estimator.kind}, "
+        f"window {config.estimator.window}, {counted(config.estimator.rounds, 'round')}, "
+        f"{1 / config.fleet.period_s:g} Hz; world '{sim_table(config).profile}', seed {figures['seed']}; "
+        f"loss {config.transport.loss:g}, delay {config.transport.delay_s:g} s"
     )
 
 
@@ -110,6 +111,11 @@ def _table(figures: dict[str, Any]) -> str:
 def _row(name: str, row: dict[str, Any], mark: str = "") -> str:
     cells = "".join(f"<td>{escape(show(row))}</td>" for _, show in COLUMNS)
     return f"<tr{mark}><td>{escape(name)}</td>{cells}</tr>\n"
+
+
+def counted(count: int, what: str) -> str:
+    """``1 drone``, ``3 drones``."""
+    return f"{count} {what}{'' if count == 1 else 's'}"
 
 
 def _number(value: float | None, digits: int, factor: float = 1.0) -> str:

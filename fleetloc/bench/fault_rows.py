@@ -39,6 +39,8 @@ class FaultRow(Table, frozen=True):
     """Bound of the error in sigmas that 99 % of epochs keep, from the begin on."""
     back_within_s: float = 10.0
     """Bound of the time from the end until the fleet is as good as without."""
+    flag_within_s: float | None = None
+    """Bound of the time from the begin to a flag of a drone that is hit; absent = none."""
     claim_at_most: float | None = None
     """Bound of the claimed sigma over the actual error, rms of the hit drones while it lasts; absent = none."""
 

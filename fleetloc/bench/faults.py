@@ -157,11 +157,15 @@ def _flagged_after_s(flown: Pooled, during: slice, hit: Sequence[int]) -> float 
 
 def misses(row: FaultRow, figures: Figures) -> list[str]:
     """Which of a row's bounds its figures do not keep, in words."""
-    ratio, back_s = figures["during"]["position_ratio_all"], figures["back_after_s"]
+    ratio = figures["during"]["position_ratio_all"]
+    back_s, flag_s = (
+        math.inf if figures[name] is None else figures[name] for name in ("back_after_s", "flagged_after_s")
+    )
     bounds = (
         ("ratio", ratio, row.ratio_at_most),
         ("sigmas", figures["sigmas_p99"], row.sigmas_at_most),
-        ("back s", math.inf if back_s is None else back_s, row.back_within_s),
+        ("back s", back_s, row.back_within_s),
+        ("flag s", flag_s, row.flag_within_s),
         ("claim", figures["claimed_over_actual_hit"], row.claim_at_most),
     )
     found = [

@@ -163,6 +163,10 @@ def test_what_the_drones_say_of_it() -> None:
     # a seed without a flag is a fault that is not flagged
     quiet = history_with(faulted(), flagged=np.zeros((TICKS, 2), bool))
     assert row_figures(ROW, pooled(faulted(), quiet))["flagged_after_s"] is None
+    prompt, late = (msgspec.structs.replace(ROW, flag_within_s=bound_s) for bound_s in (0.5, 0.4))
+    assert "flag s 0.5 > 0.4" in row_figures(late, pooled(faulted()))["misses"]
+    assert not [each for each in row_figures(prompt, pooled(faulted()))["misses"] if each.startswith("flag")]
+    assert "flag s inf > 0.5" in row_figures(prompt, pooled(quiet))["misses"]
 
 
 def test_a_fleet_is_back_when_it_stays_as_good_as_without_the_fault() -> None:

@@ -50,7 +50,7 @@ _TEXTS = {
     What.UNKNOWN: "position unknown",
     What.UNCERTAIN: "position uncertain",
     What.AMBIGUOUS: "not observable: the ranges leave more than one place",
-    What.TOO_FEW_RANGED: "not observable: ranges to {0.value:.0f} of {0.limit:.0f} located neighbours",
+    What.TOO_FEW_RANGED: "not observable: ranges to {0.value:.0f} located neighbours, {0.limit:.0f} needed",
     What.ONE_PLANE: "not observable: all located neighbours in one plane",
     What.MIRRORED: "not observable",
     What.NOT_OBSERVABLE: "not observable",

@@ -297,6 +297,11 @@ function draw() {
 function setTheme(name) {
   document.documentElement.dataset.theme = name;
   byId("theme").textContent = name === "dark" ? "light" : "dark";
+}
+
+function chooseTheme() {  // what was chosen is kept; until then the page follows the system
+  const name = document.documentElement.dataset.theme === "dark" ? "light" : "dark";
+  setTheme(name);
   localStorage.setItem("theme", name);
 }
 
@@ -306,7 +311,7 @@ function fit() {
   draw();
 }
 
-byId("theme").onclick = () => setTheme(document.documentElement.dataset.theme === "dark" ? "light" : "dark");
+byId("theme").onclick = chooseTheme;
 byId("fit").onclick = fit;
 setTheme(localStorage.getItem("theme") || (matchMedia("(prefers-color-scheme: dark)").matches ? "dark" : "light"));
 const top_ = byId("top");

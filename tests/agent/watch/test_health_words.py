@@ -43,7 +43,9 @@ def silent(*agents: int) -> tuple[Finding, ...]:
         ((UNOBSERVABLE,), Health(State.DEGRADED, ("not observable",), alarm=True)),
         (
             (FEW, NO_FIX),
-            Health(State.DEGRADED, ("not observable: ranges to 2 of 3 located neighbours", "no GPS"), alarm=True),
+            Health(
+                State.DEGRADED, ("not observable: ranges to 2 located neighbours, 3 needed", "no GPS"), alarm=True
+            ),
         ),
         (
             (NOT_YET, TWO_PLACES, NO_FIX),
@@ -61,7 +63,7 @@ def test_the_state_is_that_of_the_gravest_finding_and_each_has_its_reason(
     ("findings", "told"),
     [
         ((TWO_PLACES, FEW, UNOBSERVABLE), "not observable: the ranges leave more than one place"),
-        ((FEW, UNOBSERVABLE), "not observable: ranges to 2 of 3 located neighbours"),
+        ((FEW, UNOBSERVABLE), "not observable: ranges to 2 located neighbours, 3 needed"),
         ((PLANE, UNOBSERVABLE), "not observable: all located neighbours in one plane"),
     ],
 )

@@ -117,6 +117,26 @@ def test_the_page_loads_updates_and_shows_a_killed_drone_within_three_seconds(tm
         assert seen.complaints == []
 
 
+@needs_browser
+@pytest.mark.slow
+@pytest.mark.realtime
+def test_a_narrow_window_still_has_a_map_and_the_page_follows_the_system_to_dark(tmp_path: Path) -> None:
+    config = fleet_file(tmp_path, 'mode = "unsigned"')
+    theme = "document.documentElement.dataset.theme"
+    with monitor(config) as url, chromium.browser(tmp_path / "profile") as seen:
+        seen.open(url, width=420, height=900)
+        until(lambda: seen.value(theme) == "light", "the page", PATIENCE_S)
+        assert seen.value("document.getElementById('top').getBoundingClientRect().height") > 400
+        # WHEN the system turns dark THEN the page does, until somebody chooses, who is remembered
+        seen.open(url, dark=True)
+        until(lambda: seen.value(theme) == "dark", "the dark page", PATIENCE_S)
+        seen.value("document.getElementById('theme').click()")
+        seen.open(url, width=421, dark=True)
+        until(lambda: seen.value("innerWidth") == 421 and seen.value(theme) is not None, "it again", PATIENCE_S)
+        assert seen.value(theme) == "light"
+        assert seen.complaints == []
+
+
 @pytest.mark.slow
 @pytest.mark.realtime
 @pytest.mark.parametrize("security", ['profile = "field"', 'profile = "lossy_field"\nencrypt = true'])

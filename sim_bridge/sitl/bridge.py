@@ -70,8 +70,8 @@ class SitlBridge:
 
     def __init__(self, config: FleetConfig, world: SitlWorld, publish_ranges: PublishRanges) -> None:
         """Raises `ConfigError` for addresses that cannot be used."""
-        self._config = config
         self._sitl = sitl_table(config)
+        self._gps_outages = sim_table(config).gps_outages
         self._world = world
         self._publish_ranges = publish_ranges
         self._drivers = UwbDrivers()
@@ -93,7 +93,7 @@ class SitlBridge:
         flown_s = time.monotonic() - start_s
         return any(
             outage.agent == agent_id and outage.from_s <= flown_s < outage.to_s
-            for outage in sim_table(self._config).gps_outages
+            for outage in self._gps_outages
         )
 
     async def open(self) -> None:

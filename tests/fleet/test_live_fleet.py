@@ -20,15 +20,14 @@ from agent.log.estimate_log import read_entries
 from fleetloc.report.fleet_results import load_results
 from fleetloc.run import run_files
 from fleetloc.run.lockstep_run import fly_in_lockstep
-from sim_bridge.world.truth import load_truth
 from tests.support.fleet_process import ROOT, FleetProcess, until
+from tests.support.informed import informed, settled
 from tests.support.machine import Witness, check_on_time, witnessed
 
 pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 Start = Callable[..., FleetProcess]
 DROPPED_WITHIN_S, BACK_WITHIN_S = 2.0, 10.0
 TAKEN_BACK_TICKS = 60
-SETTLED_S = 10.0
 
 
 def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fleet: Start, tmp_path: Path) -> None:
@@ -69,23 +68,10 @@ def check_accuracy(config: FleetConfig, live: Path, lockstep: Path) -> None:
         (age, error_m), (usual, expected_m) = (settled(config, folder, agent_id) for folder in (live, lockstep))
         (ages,), counts = np.unique(usual, axis=0, return_counts=True)
         assert counts.sum() >= 90
-        informed = (age == ages).all(axis=1)
-        window = config.estimator.window
-        settled_again = np.convolve(informed, np.ones(window), "valid") == window
-        assert settled_again.sum() >= 40
-        rmse_m = np.sqrt(np.mean(error_m[window - 1 :][settled_again] ** 2))
+        had_all = informed(age, ages, config.estimator.window)
+        assert had_all.sum() >= 40
+        rmse_m = np.sqrt(np.mean(error_m[had_all] ** 2))
         assert rmse_m == pytest.approx(np.sqrt(np.mean(expected_m**2)), rel=0.15)
-
-
-def settled(config: FleetConfig, folder: Path, agent_id: int) -> tuple[np.ndarray, np.ndarray]:
-    """From `SETTLED_S` on, by tick: ages ``(K, n)`` of the data, own position errors ``(K,)`` in m."""
-    header, entries = read_entries(folder / f"agent_{agent_id:03d}.estimates")
-    truth, slot = load_truth(folder / "truth.npz"), config.ids.index(agent_id)
-    unix_s = entries["t_s"] + header.epoch_unix_s
-    inside = (unix_s >= truth.time_unix_s[0] + SETTLED_S) & (unix_s < truth.time_unix_s[-1])
-    place_m = entries["mean"][inside].reshape(-1, len(config.ids), 6)[:, slot, :3]
-    error_m = np.linalg.norm(place_m - truth.at(unix_s[inside])[:, slot, :3], axis=1)
-    return entries["age_ticks"][inside], error_m
 
 
 def check_page(page: str) -> None:

@@ -66,6 +66,7 @@ class FleetProcess:
         self.process = subprocess.Popen(
             [sys.executable, "-m", "fleetloc", "fleet", str(config), "--out", str(out), *arguments],
             cwd=ROOT, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+            start_new_session=True,  # as from a terminal of its own, with a share of the machine of its own
         )  # fmt: skip
 
     def log(self, agent_id: int) -> str:

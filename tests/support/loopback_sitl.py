@@ -1,13 +1,13 @@
 """Our simulated autopilots, served as simulators serve theirs: ArduPilot as a TCP server, PX4 sending UDP.
 
-As a process: ``python -m tests.support.loopback_sitl`` with one line of JSON on stdin: ``{"1": "tcp:127.0.0.1:5760",
-...}``, addresses as the bridge opens them; odd agents are PX4, even ones ArduPilot. It ends with its stdin.
+As a process: ``python -m tests.support.loopback_sitl 1 tcp:127.0.0.1:5760`` is the simulator of agent 1 at an address
+as the bridge opens it; odd agents are PX4, even ones ArduPilot. It ends with its stdin. Every drone has a process of
+its own, as with real simulators: on a busy machine, where each process gets a share, one for all would fall behind.
 """
 
 from __future__ import annotations
 
 import asyncio
-import json
 import sys
 import time
 import traceback
@@ -112,13 +112,12 @@ def _report(task: asyncio.Task[None]) -> None:
         traceback.print_exception(task.exception())
 
 
-async def _main() -> None:
-    links = {int(agent): parse_endpoint(link) for agent, link in json.loads(sys.stdin.readline()).items()}
-    simulation = Simulation(grounded_fleet(tuple(links)), time.monotonic(), time.time() - time.monotonic())
-    sitl = LoopbackSitl(simulation)
-    async with sitl.serve(links):
+async def _main(agent: int, link: str) -> None:
+    scenario = grounded_fleet((agent,), seed=agent)
+    simulation = Simulation(scenario, time.monotonic(), time.time() - time.monotonic())
+    async with LoopbackSitl(simulation).serve({agent: parse_endpoint(link)}):
         await asyncio.to_thread(sys.stdin.read)
 
 
 if __name__ == "__main__":
-    asyncio.run(_main())
+    asyncio.run(_main(int(sys.argv[1]), sys.argv[2]))

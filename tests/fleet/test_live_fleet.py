@@ -27,7 +27,7 @@ from tests.support.machine import Witness, check_on_time, witnessed
 pytestmark = [pytest.mark.slow, pytest.mark.realtime]
 Start = Callable[..., FleetProcess]
 DROPPED_WITHIN_S, BACK_WITHIN_S = 2.0, 10.0
-TAKEN_BACK_TICKS = 60
+TAKEN_BACK_TICKS, MIN_INFORMED = 60, 10
 
 
 def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fleet: Start, tmp_path: Path) -> None:
@@ -37,7 +37,9 @@ def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fl
     assert code == 0, stderr
     assert str(fleet.out / "report.html") in stdout
     assert fleet.nothing_left()
-    report = fleet.report()
+    config, report = load_config(fleet.out / "fleet.toml"), fleet.report()
+    results, behind = load_results(config, fleet.out), Witness(witness)
+    in_time = behind.sound(results.start_unix_s + results.tracks[0].time_s, results.period_s).mean()
     assert (tmp_path / "figures.json").read_bytes() == (fleet.out / "report.json").read_bytes()
     assert report["duration_s"] == pytest.approx(20.0, abs=0.1)
     assert report["seed"] == 1
@@ -50,12 +52,11 @@ def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fl
         assert agent["rss_mb"] > 0.0
         assert agent["packets"]["received"] > 300
         assert agent["packets"]["rejected"] == {}
-        assert agent["sensors"]["imu"]["used"] > 1500
-        assert agent["sensors"]["gps"]["used"] > 150
-        assert agent["sensors"]["range"]["used"] > 150
+        assert agent["sensors"]["imu"]["used"] > 1500 * in_time  # those that come too late are not
+        assert agent["sensors"]["gps"]["used"] > 150 * in_time
+        assert agent["sensors"]["range"]["used"] > 150 * in_time
     check_page((fleet.out / "report.html").read_text())
-    config = load_config(fleet.out / "fleet.toml")
-    check_on_time(load_results(config, fleet.out), Witness(witness))
+    check_on_time(results, behind)
     again = tmp_path / "again"
     again.mkdir()
     fly_in_lockstep(config, again)
@@ -63,15 +64,23 @@ def test_a_live_run_is_on_time_consistent_and_equal_to_the_lockstep_run(start_fl
 
 
 def check_accuracy(config: FleetConfig, live: Path, lockstep: Path) -> None:
-    """An agent that had in time what it has in virtual time is as good; on a busy machine some packets are late."""
+    """An agent that had in time what it has in virtual time errs as it does there, tick by tick of the same flight.
+
+    On a busy machine some packets are late; the ticks that this touched are left out.
+    """
     for agent_id in config.ids:
-        (age, error_m), (usual, expected_m) = (settled(config, folder, agent_id) for folder in (live, lockstep))
-        (ages,), counts = np.unique(usual, axis=0, return_counts=True)
+        flown, expected = (settled(config, folder, agent_id) for folder in (live, lockstep))
+        (usual,), counts = np.unique(expected.age_ticks, axis=0, return_counts=True)
         assert counts.sum() >= 90
-        had_all = informed(age, ages, config.estimator.window)
-        assert had_all.sum() >= 40
-        rmse_m = np.sqrt(np.mean(error_m[had_all] ** 2))
-        assert rmse_m == pytest.approx(np.sqrt(np.mean(expected_m**2)), rel=0.15)
+        ticks = [np.round(each.time_s / config.fleet.period_s).astype(int) for each in (flown, expected)]
+        _, mine, theirs = np.intersect1d(*ticks, return_indices=True)
+        had_all = informed(flown.age_ticks, usual, config.estimator.window)[mine]
+        assert had_all.sum() >= MIN_INFORMED
+        rmse_m, expected_m = (
+            float(np.sqrt(np.mean(error_m[had_all] ** 2)))
+            for error_m in (flown.error_m[mine], expected.error_m[theirs])
+        )
+        assert rmse_m == pytest.approx(expected_m, rel=0.05)
 
 
 def check_page(page: str) -> None:
@@ -89,21 +98,22 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path:
         pid, killed_at = fleet.pid_of(3), datetime.now()
         os.kill(pid, signal.SIGKILL)
         until(lambda: "neighbour 3 has left" in fleet.log(2), "agent 2 notices")
-    restarted = subprocess.Popen(
-        [sys.executable, "-m", "fleetloc", "agent", str(fleet.out / "fleet.toml"), "--id", "3"],
-        cwd=ROOT, stderr=subprocess.DEVNULL,
-    )  # fmt: skip
-    try:
-        until(lambda: entries_of_second_life(fleet.out) >= TAKEN_BACK_TICKS, "the restarted agent estimates")
-        fleet.interrupt()
-        code, _, stderr = fleet.finish()
-    finally:
-        restarted.terminate()
-        restarted.wait()
+        restarted = subprocess.Popen(
+            [sys.executable, "-m", "fleetloc", "agent", str(fleet.out / "fleet.toml"), "--id", "3"],
+            cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True,
+        )  # fmt: skip
+        try:
+            until(lambda: entries_of_second_life(fleet.out) >= TAKEN_BACK_TICKS, "the restarted agent estimates")
+            fleet.interrupt()
+            code, _, stderr = fleet.finish()
+        finally:
+            restarted.terminate()
+            restarted.wait()
     assert code == 0, stderr
+    behind = Witness(witness)
     assert "agent 3 killed by SIGKILL" in stderr
     dropped_s = time_of(fleet.log(2), "neighbour 3 has left").timestamp() - killed_at.timestamp()
-    late_s = Witness(witness).lost_s(killed_at.timestamp(), killed_at.timestamp() + dropped_s)
+    late_s = behind.lost_s(killed_at.timestamp(), killed_at.timestamp() + dropped_s)
     assert 0.0 < dropped_s < DROPPED_WITHIN_S + late_s
     report = fleet.report()
     assert [death["name"] for death in report["fleet"]["deaths"]] == ["agent 3"]
@@ -111,7 +121,7 @@ def test_a_killed_daemon_is_dropped_and_taken_back(start_fleet: Start, tmp_path:
     assert killed["daemons"] == 2
     assert killed["ticks_on_time"] < killed["ticks_expected"]
     check_ticks_without_gap(fleet.out)
-    check_taken_back(fleet.out, killed_at.timestamp())
+    check_taken_back(fleet.out, killed_at.timestamp(), behind)
     assert fleet.nothing_left()
 
 
@@ -132,16 +142,16 @@ def check_ticks_without_gap(out: Path) -> None:
         assert (np.diff(entries["tick"]) == 1).all()
 
 
-def check_taken_back(out: Path, killed_unix_s: float) -> None:
+def check_taken_back(out: Path, killed_unix_s: float, witness: Witness) -> None:
     """In the eyes of agent 2 the information of agent 3 grows old, and is fresh again soon after the restart."""
     header, entries = read_entries(out / "agent_002.estimates")
     _, second_life = read_entries(out / "agent_003.estimates")
     age, unix_s = entries["age_ticks"][:, 2], entries["t_s"] + header.epoch_unix_s
     assert age[(unix_s > killed_unix_s)].max() > 5
     back_s = second_life["t_s"][0] + header.epoch_unix_s
-    fresh = unix_s[(unix_s > back_s) & (age <= 2)]
-    assert len(fresh)
-    assert fresh[0] - back_s < BACK_WITHIN_S
+    fresh_s = unix_s[(unix_s > back_s) & (age <= 2)]
+    assert len(fresh_s)
+    assert fresh_s[0] - back_s < BACK_WITHIN_S + witness.lost_s(back_s, fresh_s[0])
 
 
 def test_ctrl_c_in_flight_ends_all_and_still_reports(start_fleet: Start) -> None:
@@ -154,7 +164,7 @@ def test_ctrl_c_in_flight_ends_all_and_still_reports(start_fleet: Start) -> None
     report = fleet.report()
     assert report["fleet"]["interrupted"] is True
     assert report["fleet"]["deaths"] == []
-    assert 0.0 < report["duration_s"] < 60.0
+    assert 0.0 < report["duration_s"] < 600.0
     assert fleet.nothing_left()
 
 

@@ -151,7 +151,7 @@ def test_a_fleet_of_both_flavours_flies_a_mission_and_knows_where_it_is(sitl: Si
 
 def check_place(config: FleetConfig, out: Path, agent: dict[str, Any]) -> None:
     """Where it had its data in time it is right, and at every time as wrong as it says."""
-    ages, error_m = settled(config, out, agent["id"])
+    _, ages, error_m = settled(config, out, agent["id"])
     had_all = informed(ages, np.full(len(config.ids), USUAL_TICKS), config.estimator.window)
     assert had_all.sum() >= MIN_INFORMED
     assert np.sqrt(np.mean(error_m[had_all] ** 2)) < BOUND_M

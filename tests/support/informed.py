@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,15 +16,24 @@ from sim_bridge.world.truth import load_truth
 SETTLED_S = 10.0
 
 
-def settled(config: FleetConfig, directory: Path, agent_id: int) -> tuple[NDArray[np.uint16], NDArray[np.float64]]:
-    """From `SETTLED_S` on, by tick: ages ``(K, n)`` of the data in ticks, own position errors ``(K,)`` in m."""
+class Settled(NamedTuple):
+    """K ticks of one agent: when, in s since the start of the world, ages ``(K, n)`` of its data in ticks, and how
+    far ``(K,)`` its own position is off, in m."""
+
+    time_s: NDArray[np.float64]
+    age_ticks: NDArray[np.uint16]
+    error_m: NDArray[np.float64]
+
+
+def settled(config: FleetConfig, directory: Path, agent_id: int) -> Settled:
+    """From `SETTLED_S` on."""
     header, entries = read_entries(run_files.record_path(directory, agent_id))
     truth, slot = load_truth(directory / run_files.TRUTH), config.ids.index(agent_id)
     unix_s = entries["t_s"] + header.epoch_unix_s
     inside = (unix_s >= truth.time_unix_s[0] + SETTLED_S) & (unix_s < truth.time_unix_s[-1])
     place_m = entries["mean"][inside].reshape(-1, len(config.ids), 6)[:, slot, :3]
     error_m = np.linalg.norm(place_m - truth.at(unix_s[inside])[:, slot, :3], axis=1)
-    return entries["age_ticks"][inside], error_m
+    return Settled(unix_s[inside] - truth.time_unix_s[0], entries["age_ticks"][inside], error_m)
 
 
 def informed(ages: NDArray[np.uint16], usual: NDArray[np.uint16], window: int) -> NDArray[np.bool_]:

@@ -24,6 +24,7 @@ from fleetloc.report.fleet_results import FleetResults
 ROOT = Path(__file__).parents[2]
 JOB_PERIOD_S, JOB_S = 0.02, 0.0025
 """An eighth of a core, as a daemon of line3 needs, in pieces as long as those of its work."""
+BEGUN = b"begun\n"
 FORGOTTEN_S = 1.0
 """Jobs further behind are left out, as a daemon leaves out ticks."""
 MAX_LATE_SHARE = 0.5
@@ -56,16 +57,21 @@ class Witness:
 
 @contextmanager
 def witnessed(folder: Path) -> Iterator[Path]:
-    """Run a witness meanwhile; gives the file for `Witness` afterwards."""
+    """Run a witness meanwhile, from its first job on; gives the file for `Witness` afterwards."""
     path = folder / "witness"
     command = [sys.executable, "-m", "tests.support.machine", str(path)]
     # a session of its own, as daemons have: where sessions share a machine it gets what a daemon gets
-    process = subprocess.Popen(command, cwd=ROOT, stdin=subprocess.PIPE, start_new_session=True)
+    process = subprocess.Popen(
+        command, cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True
+    )
+    assert process.stdin is not None
+    assert process.stdout is not None
     try:
+        assert process.stdout.readline() == BEGUN, "the witness of the machine's lateness does not begin"
         yield path
     finally:
-        assert process.stdin is not None
         process.stdin.close()
+        process.stdout.close()
         process.wait()
 
 
@@ -81,6 +87,8 @@ def check_on_time(results: FleetResults, witness: Witness, least: float = 0.95) 
 
 def _keep_time(path: str) -> None:
     """Until stdin ends, write pairs of float64: a UTC second at which a job was due, and how late it was done."""
+    sys.stdout.buffer.write(BEGUN)
+    sys.stdout.buffer.flush()
     with open(path, "wb", buffering=0) as file:
         due_s = time.time()
         while not select.select([sys.stdin], [], [], max(due_s - time.time(), 0.0))[0]:

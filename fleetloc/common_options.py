@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import inspect
 import re
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, get_args, get_type_hints
+from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 
 import typer
-from typer.core import TyperArgument, TyperCommand, TyperOption
+from typer.core import TyperCommand
+from typer.models import ArgumentInfo, OptionInfo
 
 from fleetloc.verbosity import set_verbosity
 
@@ -32,6 +34,7 @@ BY_NAME = {
     "--estimator": "KIND",
     "--arrival": "WHEN",
     "--graph": "GRAPH",
+    "--acados": "PYTHON",
 }
 """What stands for a value in help, by the option."""
 PLACEHOLDERS: dict[Any, str] = {int: "N", float: "NUMBER", Path: "FILE", str: "TEXT"}
@@ -39,15 +42,7 @@ PLACEHOLDERS: dict[Any, str] = {int: "N", float: "NUMBER", Path: "FILE", str: "T
 
 
 class PlainCommand(TyperCommand):
-    """A command whose help shows ``CONFIG`` and ``FILE`` where typer would show ``{config}`` and ``<list[Path]>``."""
-
-    def __init__(self, *arguments: Any, **options: Any) -> None:
-        super().__init__(*arguments, **options)
-        for parameter in self.params:
-            if isinstance(parameter, TyperArgument) and parameter.metavar is None:
-                parameter.metavar = str(parameter.name).upper()
-            elif isinstance(parameter, TyperOption) and parameter.metavar is None and _takes_a_value(parameter):
-                parameter.metavar = _placeholder(parameter)
+    """A command whose help shows no braces and types around ``CONFIG`` and ``FILE``, as typer would."""
 
     def get_help(self, ctx: Any) -> str:
         """The help; a type behind an argument gives way to blanks, so that the columns stand."""
@@ -79,7 +74,10 @@ def _with_verbosity(command: Callable[..., Any]) -> Callable[..., Any]:
         set_verbosity(-1 if given["quiet"] else given["verbose"])
         return command(**{name: value for name, value in given.items() if name in own})
 
-    parameters = [each.replace(annotation=hints.get(each.name, each.annotation)) for each in _all(signature)]
+    parameters = [
+        each.replace(annotation=_in_words(each.name, hints.get(each.name, each.annotation)))
+        for each in _all(signature)
+    ]
     run.__dict__.pop("__wrapped__")
     run.__signature__ = signature.replace(parameters=parameters)  # type: ignore[attr-defined]
     run.__annotations__ = {each.name: each.annotation for each in parameters}
@@ -93,13 +91,24 @@ def _all(signature: inspect.Signature) -> Iterator[inspect.Parameter]:
             yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
-def _takes_a_value(option: TyperOption) -> bool:
-    return not (option.is_flag or option.count) and not option.type_descriptor.is_choice
+def _in_words(name: str, annotation: Any) -> Any:
+    """The annotation of a parameter, saying what stands for its value in help where it does not say so itself."""
+    said = []
+    for each in getattr(annotation, "__metadata__", ()):
+        if isinstance(each, ArgumentInfo | OptionInfo) and each.metavar is None:
+            each = copy.copy(each)
+            each.metavar = name.upper() if isinstance(each, ArgumentInfo) else _placeholder(name, annotation, each)
+        said.append(each)
+    return Annotated[annotation.__origin__, *said] if said else annotation
 
 
-def _placeholder(option: TyperOption) -> str:
-    named = next((BY_NAME[name] for name in option.opts if name in BY_NAME), None)
-    if named is not None:
-        return named
-    kind = option.type_descriptor.annotation
-    return PLACEHOLDERS.get(next(iter(get_args(kind)), kind), "VALUE")
+def _placeholder(name: str, annotation: Any, option: OptionInfo) -> str | None:
+    """What stands for an option's value; none for a flag, which has no value, and a choice, which lists them."""
+    kind = annotation.__origin__
+    while get_args(kind) and get_origin(kind) is not Literal:  # of what an optional value or a list holds
+        kind = next(each for each in get_args(kind) if each is not type(None))
+    if option.count or kind is bool or get_origin(kind) is Literal:
+        return None
+    given = (option.default, *(option.param_decls or ()))  # in an annotation the first name stands for a default
+    spelled = [each for each in given if str(each).startswith("--")] or [f"--{name.replace('_', '-')}"]
+    return next((BY_NAME[each] for each in spelled if each in BY_NAME), PLACEHOLDERS.get(kind, "VALUE"))

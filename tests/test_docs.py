@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import importlib
 import re
-import shlex
 import tomllib
 from pathlib import Path
 from typing import Any
@@ -27,6 +26,7 @@ from fleetloc import UwbFrame, encode_uwb_json
 from fleetloc.cli import build_app
 from fleetloc.whole_config import OTHER_TABLES, whole
 from sim_bridge.sitl.mission import load_mission
+from tests.support.command_names import complaint
 from tests.support.doc_pages import DOCS, FENCE, PAGES, ROOT, Block, blocks, written_commands
 from transport.errors import Reason
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
@@ -37,7 +37,6 @@ SITE = ROOT / "mkdocs.yml"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
 ROOMS = "configs|tests|estimators|transport|agent|sim_bridge|fleetloc"
 OURS = re.compile(rf"(?<![\w/.])(?:{ROOMS})/(?:[\w-]+/)*[\w-]+\.(?:py|toml)\b")
-CONTROL = ("|", "&", "&&", "||", ";", ">", "<", "2>", "#", "\\")
 TABLES = {field.name for field in msgspec.structs.fields(FleetConfig)} - {"others"} | OTHER_TABLES.keys()
 
 
@@ -93,32 +92,6 @@ def test_pictures_are_small() -> None:
 
 
 # --- commands -------------------------------------------------------------------------------------------------
-
-
-def complaint(app: Any, text: str) -> str | None:
-    """What is wrong with the names of commands and options in a line; ``None`` if nothing is.
-
-    Only names are looked at, so that a synopsis (``fleetloc check CONFIG [--print]``) passes too.
-    """
-    command = app
-    try:
-        words = shlex.split(re.sub(r"[\[\]]", " ", text).replace("\\|", "|"), comments=True)
-    except ValueError as error:
-        return str(error)
-    for word in words:
-        if word in CONTROL:
-            break
-        subcommands: dict[str, Any] | None = getattr(command, "commands", None)
-        if re.match(r"--?[a-z]", word):
-            options = {name for each in command.params for name in (*each.opts, *each.secondary_opts)} | {"--help"}
-            if word.partition("=")[0] not in options:
-                return f"{command.name} has no option {word}; it has {sorted(options)}"
-        elif subcommands is not None:
-            for name in re.split(r"[|,]", word.strip("{}")):
-                if re.fullmatch(r"[a-z]\w*", name) and name not in subcommands:
-                    return f"{command.name} has no command {name}; it has {sorted(subcommands)}"
-            command = subcommands.get(word, command)
-    return None
 
 
 def test_every_command_and_option_shown_exists() -> None:

@@ -1,0 +1,225 @@
+"""How far a receiver's fixes wander: a bank of filters over one receiver's own fixes, velocities and accelerations.
+
+Fixes that claim 0.4 m may be white noise of 0.4 m, or wander by metres over a minute: from the fixes of a second nobody
+can tell. Over several, the drone's own velocity and acceleration can. Each filter of the bank follows one axis with
+its own hypothesis of the wander's size,
+
+    state  p, v, e (error of the acceleration), w (wander, Gauss-Markov),    fix = p + w + white noise,
+
+and the likelihood of what was measured weighs the hypotheses (multiple-model adaptive estimation; D. T. Magill, 1965).
+A minute of them is remembered. Horizontal axes have one size, the vertical one its own.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.compiled.entries import entry, kernel
+from estimators.model.measurements import ROW, Matrix, RowTable, Vector
+from estimators.model.row_kernels import POSITION, VELOCITY, IntArray
+from estimators.systematic.slow_errors import ACCELERATION_S, WANDER_S
+
+WANDERS_M = np.array([0.02, 0.15, 0.4, 0.8, 1.6, 4.0])
+"""Standard deviations of the wander per axis."""
+WHITES = np.array([0.35, 0.6, 1.0, 2.0])
+"""What the white noise of the fixes is, of what the receiver claims."""
+HYPOTHESES_M, FACTORS = np.tile(WANDERS_M, len(WHITES)), np.repeat(WHITES, len(WANDERS_M))
+"""All pairs of the two."""
+MEMORY_FIXES = 300.0
+"""Fixes that are remembered, some minute of them."""
+TRUST_NATS = 5.0
+"""Log odds that a receiver does not wander, once it has been watched, before any evidence."""
+WATCHED_S = 5.0
+"""So long a time of fixes tells a wander: of less, any is as likely as another."""
+CLAIM_SHARE = 0.05
+"""Of a new fix in the average of what a receiver claims."""
+VERTICAL = 1.0, 2.5
+"""The vertical wander, which no velocity tells, against the horizontal one: receivers see half a sky."""
+OUTLIER_SQUARE = 25.0
+"""A normalised innovation beyond this says nothing of a wander."""
+MOST_OUTLIERS = 15
+"""So many fixes in a row that no hypothesis explains: the receiver is somewhere else, the filters start anew."""
+ACCEL_ERROR_MPS2 = 0.3
+
+
+class ReceiverWanders:
+    """The banks of all receivers of a fleet of ``agents``."""
+
+    def __init__(self, agents: int, period_s: float) -> None:
+        self._period_s = period_s
+        self._make(agents)
+
+    def _make(self, agents: int) -> None:
+        models = len(HYPOTHESES_M)
+        self._means = np.zeros((agents, 3, models, 4))
+        self._covariances = np.zeros((agents, 3, models, 4, 4))
+        self._nats = np.zeros((agents, 2, models))
+        self._outliers = np.full(agents, -1, np.int64)
+        self._fixes = np.zeros(agents, np.int64)
+        self._claims_m = np.zeros((agents, 2))
+
+    def weigh(self, rows: RowTable, accel: Vector, accel_variance: Vector) -> None:
+        """Take in the rows of one tick, and the accelerations ``(3n,)`` from it to the next."""
+        arrays = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
+        _weigh(np.ascontiguousarray(rows), accel, accel_variance, self._period_s, *arrays)
+
+    def sizes_m(self) -> Matrix:
+        """Root mean square ``(n, 3)`` of the wander over the hypotheses, per axis."""
+        weights = self._weights()
+        size = np.sqrt(weights @ HYPOTHESES_M**2)
+        kept = np.sqrt(weights @ FACTORS**2)
+        unused_m = self._claims_m * np.sqrt(np.maximum(1.0 - kept**2, 0.0))
+        size = np.maximum(np.maximum(size, unused_m), np.median(size, axis=0))
+        size[:, 1] = np.clip(size[:, 1], VERTICAL[0] * size[:, 0], VERTICAL[1] * size[:, 0])
+        return np.asarray(size[:, [0, 0, 1]])
+
+    def white_factors(self) -> Matrix:
+        """Root mean square ``(n, 3)``, per axis, of the white noise of the fixes over what their receiver claims."""
+        return np.sqrt(self._weights() @ FACTORS**2)[:, [0, 0, 1]]
+
+    def _weights(self) -> Matrix:
+        """Of the hypotheses ``(n, 2, models)``, horizontal and vertical."""
+        nats = self._nats + np.where((HYPOTHESES_M == WANDERS_M[0]) & (FACTORS >= 1.0), TRUST_NATS, 0.0) * self._watched()
+        nats -= nats.max(-1, keepdims=True)
+        weights = np.exp(nats)
+        return np.asarray(weights / weights.sum(-1, keepdims=True))
+
+    def _watched(self) -> NDArray[np.float64]:
+        """How far ``(n, 1, 1)`` each receiver has been watched, 0..1."""
+        return np.minimum(self._fixes * self._period_s / WATCHED_S, 1.0)[:, None, None]
+
+    def change_members(self, stayed: dict[int, int], agents: int) -> None:
+        """Go on with another fleet; ``stayed``: by new slot, the old one."""
+        before = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
+        self._make(agents)
+        after = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
+        for slot, old in stayed.items():
+            for new_array, old_array in zip(after, before, strict=True):
+                new_array[slot] = old_array[old]
+
+
+@entry(
+    "void(ROW[::1], float64[::1], float64[::1], float64, float64[:, :, :, ::1], float64[:, :, :, :, ::1],"
+    " float64[:, :, ::1], int64[::1], int64[::1], float64[:, ::1])",
+    ROW=ROW,
+)
+def _weigh(
+    rows: RowTable,
+    accel: Vector,
+    accel_variance: Vector,
+    dt: float,
+    means: Matrix,
+    covariances: Matrix,
+    nats: Matrix,
+    outliers: IntArray,
+    fixes: IntArray,
+    claims: Matrix,
+) -> None:
+    agents, models = means.shape[0], means.shape[2]
+    forget = 1.0 - 1.0 / MEMORY_FIXES
+    fixed = np.zeros(agents, np.int64)  # 1: a fix, 2: one that some hypothesis explains
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        if (row["kind"] != POSITION and row["kind"] != VELOCITY) or np.isfinite(row["half_width"]):
+            continue
+        axis = _axis(row)
+        if axis < 0:
+            continue
+        a, place = row["agent"], row["kind"] == POSITION
+        if outliers[a] < 0 or (outliers[a] == 0 and covariances[a, axis, 0, 0, 0] == 0.0):
+            if place:
+                _begin(row["value"], row["variance"], means[a, axis], covariances[a, axis])
+                outliers[a] = 0
+            continue
+        if covariances[a, axis, 0, 0, 0] == 0.0:
+            continue
+        seen = np.zeros(4)
+        seen[0], seen[1], seen[3] = (1.0, row["offset_s"], 1.0) if place else (0.0, 1.0, 0.0)
+        explained = _correct(row, seen, place, means[a, axis], covariances[a, axis], nats[a, 0 if axis < 2 else 1])
+        if place:
+            claim, group = np.sqrt(row["variance"]), 0 if axis < 2 else 1
+            claims[a, group] += CLAIM_SHARE * (claim - claims[a, group]) if claims[a, group] > 0.0 else claim
+            fixed[a] = max(fixed[a], 2 if explained else 1)
+    for a in range(agents):
+        if fixed[a] > 0:
+            fixes[a] += 1
+            outliers[a] = outliers[a] + 1 if fixed[a] == 1 else 0
+            for group in range(2):
+                for h in range(models):
+                    nats[a, group, h] *= forget
+            if outliers[a] > MOST_OUTLIERS:
+                outliers[a] = -1
+                covariances[a] = 0.0
+        for axis in range(3):
+            for h in range(models):
+                if covariances[a, axis, h, 0, 0] > 0.0:
+                    push, noise = accel[3 * a + axis], accel_variance[3 * a + axis]
+                    _predict(means[a, axis, h], covariances[a, axis, h], push, noise, HYPOTHESES_M[h], dt)
+
+
+@kernel
+def _axis(row: np.void) -> int:
+    """The NED axis that a row is along; -1 for another direction."""
+    if row["x"] == 1.0:
+        return 0
+    if row["y"] == 1.0:
+        return 1
+    return 2 if row["z"] == 1.0 else -1
+
+
+@kernel
+def _begin(value: float, variance: float, mean: Matrix, covariance: Matrix) -> None:
+    """Start one axis of one receiver at a fix."""
+    for h in range(mean.shape[0]):
+        size = HYPOTHESES_M[h] ** 2
+        mean[h] = 0.0
+        mean[h, 0] = value
+        covariance[h] = 0.0
+        covariance[h, 0, 0] = variance + size
+        covariance[h, 0, 3] = -size
+        covariance[h, 3, 0] = -size
+        covariance[h, 3, 3] = size
+        covariance[h, 1, 1] = 100.0
+        covariance[h, 2, 2] = ACCEL_ERROR_MPS2**2
+
+
+@kernel
+def _correct(row: np.void, seen: Vector, place: bool, mean: Matrix, covariance: Matrix, nats: Vector) -> bool:
+    """Correct all hypotheses of one axis by a row; whether any explains it."""
+    explained = False
+    column = np.empty(4)
+    for h in range(mean.shape[0]):
+        variance = row["variance"] * (FACTORS[h] ** 2 if place else 1.0)
+        innovation = row["value"]
+        for i in range(4):
+            innovation -= seen[i] * mean[h, i]
+            column[i] = 0.0
+            for j in range(4):
+                column[i] += covariance[h, i, j] * seen[j]
+        for i in range(4):
+            variance += seen[i] * column[i]
+        square = innovation * innovation / variance
+        nats[h] -= 0.5 * (np.log(variance) + min(square, OUTLIER_SQUARE))
+        if square > OUTLIER_SQUARE:
+            continue
+        explained = True
+        for i in range(4):
+            mean[h, i] += column[i] / variance * innovation
+            for j in range(4):
+                covariance[h, i, j] -= column[i] * column[j] / variance
+    return explained
+
+
+@kernel
+def _predict(mean: Vector, covariance: Matrix, push: float, noise: float, size: float, dt: float) -> None:
+    """One axis of one hypothesis one tick on."""
+    keep_e, keep_w = np.exp(-dt / ACCELERATION_S), np.exp(-dt / WANDER_S)
+    move = np.array(
+        [[1.0, dt, -0.5 * dt * dt, 0.0], [0.0, 1.0, -dt, 0.0], [0.0, 0.0, keep_e, 0.0], [0.0, 0.0, 0.0, keep_w]]
+    )
+    into = np.array([0.5 * dt * dt, dt, 0.0, 0.0])
+    mean[:] = np.dot(move, mean) + into * push
+    covariance[:, :] = np.dot(np.dot(move, covariance), move.T.copy()) + noise * np.outer(into, into)
+    covariance[2, 2] += (1.0 - keep_e * keep_e) * ACCEL_ERROR_MPS2**2
+    covariance[3, 3] += (1.0 - keep_w * keep_w) * size * size

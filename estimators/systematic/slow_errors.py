@@ -1,0 +1,109 @@
+"""The slow errors of a fleet's sensors, as constants over a window that its rows and inputs hold.
+
+What lasts for longer than a window is no noise: the wander of a receiver's fixes, of its own and common to all that see
+the same sky; the error of an acceleration by bias and tilt; the bias of the ranges between two antennas. Each is a
+Gauss-Markov process that enters the rows:
+
+    fix of agent a along u:        + u . w_a + u . w
+    range between a and b:         + b_ab
+    acceleration of a:             + e_a
+
+Its size follows the data (`estimators.systematic.sizes`). Order of the q errors: wander ``3n``, acceleration ``3n``, common wander ``3``, pairs ``n (n - 1) / 2``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from estimators.compiled.entries import entry
+from estimators.model.measurements import ROW, Matrix, RowTable, Vector
+from estimators.model.row_kernels import POSITION, RANGE, IntArray
+
+WANDER_S = 60.0
+"""Time constant of the wander of fixes."""
+ACCELERATION_S = 20.0
+"""Of the error of accelerations in NED: a bias turns with the body, a tilt lasts longer."""
+PAIR_S = 600.0
+"""Of the bias of ranges between two antennas."""
+COUPLED = 7
+"""Slow errors in one row at most."""
+
+
+def count(agents: int) -> int:
+    """How many slow errors a fleet has."""
+    return 6 * agents + 3 + agents * (agents - 1) // 2
+
+
+def wander_of(slot: int) -> slice:
+    """Wander of an agent's fixes."""
+    return slice(3 * slot, 3 * slot + 3)
+
+
+def acceleration_of(slot: int, agents: int) -> slice:
+    """Error of an agent's acceleration."""
+    return slice(3 * (agents + slot), 3 * (agents + slot) + 3)
+
+
+def common(agents: int) -> slice:
+    """Wander that all fixes share."""
+    return slice(6 * agents, 6 * agents + 3)
+
+
+def pair_of(one: int, other: int, agents: int) -> int:
+    """Bias of the ranges between two agents."""
+    a, b = min(one, other), max(one, other)
+    return 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1
+
+
+def kept_per_tick(agents: int, period_s: float) -> Vector:
+    """Factor ``(q,)`` by which each error decays in a tick."""
+    times = np.empty(count(agents))
+    times[: 3 * agents] = WANDER_S
+    times[3 * agents : 6 * agents] = ACCELERATION_S
+    times[common(agents)] = WANDER_S
+    times[6 * agents + 3 :] = PAIR_S
+    return np.exp(-period_s / times)
+
+
+def places_after(before: int, stayed: dict[int, int], after: int) -> IntArray:
+    """Where each slow error of a changed fleet was, ``(q,)``, -1 for those that begin anew.
+
+    ``stayed``: by slot in the new fleet of ``after`` agents, the slot in the old one of ``before``.
+    """
+    was = np.full(count(after), -1, np.int64)
+    was[common(after)] = np.arange(6 * before, 6 * before + 3)
+    for slot, old in stayed.items():
+        was[wander_of(slot)] = np.arange(3 * old, 3 * old + 3)
+        was[acceleration_of(slot, after)] = np.arange(3 * (before + old), 3 * (before + old) + 3)
+        for other, old_other in stayed.items():
+            if other > slot:
+                was[pair_of(slot, other, after)] = pair_of(old, old_other, before)
+    return was
+
+
+def couplings(rows: RowTable, agents: int) -> tuple[IntArray, Matrix]:
+    """Which slow errors each row holds ``(m, 7)``, -1 where fewer, and by how much."""
+    at, by = np.full((len(rows), COUPLED), -1, np.int64), np.zeros((len(rows), COUPLED))
+    _couple(rows, agents, at, by)
+    return at, by
+
+
+@entry("void(ROW[::1], int64, int64[:, ::1], float64[:, ::1])", ROW=ROW)
+def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
+    for r in range(rows.shape[0]):
+        row, j = rows[r], 0
+        if np.isfinite(row["half_width"]):  # a sensor with a hard bound has no other errors
+            continue
+        if row["kind"] == POSITION:
+            direction = (row["x"], row["y"], row["z"])
+            for i in range(3):
+                if direction[i] != 0.0:
+                    at[r, j], by[r, j] = 3 * row["agent"] + i, direction[i]
+                    at[r, j + 1], by[r, j + 1] = 6 * agents + i, direction[i]
+                    j += 2
+        elif row["kind"] == RANGE:
+            a, b = min(row["agent"], row["other"]), max(row["agent"], row["other"])
+            at[r, 0], by[r, 0] = 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1, 1.0

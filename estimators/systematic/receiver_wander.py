@@ -1,16 +1,19 @@
 """How far a receiver's fixes wander: a bank of filters over one receiver's own fixes, velocities and accelerations.
 
-Fixes that claim 0.4 m may be white noise of 0.4 m, or wander by metres over a minute: from the fixes of a second nobody
-can tell. Over several, the drone's own velocity and acceleration can. Each filter of the bank follows one axis with
-its own hypothesis of the wander's size,
+Fixes that claim 0.4 m may be white noise of 0.4 m, or wander by metres over a minute: from the fixes of a second
+nobody can tell. Over several, the drone's own velocity and acceleration can. Each filter of the bank follows one axis
+with its own hypothesis of the wander's size and of the white noise,
 
     state  p, v, e (error of the acceleration), w (wander, Gauss-Markov),    fix = p + w + white noise,
 
-and the likelihood of what was measured weighs the hypotheses (multiple-model adaptive estimation; D. T. Magill, 1965).
-A minute of them is remembered. Horizontal axes have one size, the vertical one its own.
+and the likelihood of what was measured weighs the hypotheses (multiple-model adaptive estimation, D. T. Magill,
+1965). Horizontal axes have one size, the vertical one its own. What a receiver claims is its whole error: where its white
+noise is less, the rest is wander.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,9 +32,9 @@ HYPOTHESES_M, FACTORS = np.tile(WANDERS_M, len(WHITES)), np.repeat(WHITES, len(W
 MEMORY_FIXES = 300.0
 """Fixes that are remembered, some minute of them."""
 TRUST_NATS = 5.0
-"""Log odds that a receiver does not wander, once it has been watched, before any evidence."""
-WATCHED_S = 5.0
-"""So long a time of fixes tells a wander: of less, any is as likely as another."""
+"""Log odds that a receiver whose white noise is all that it claims does not wander, once it has been watched."""
+WATCHED_FIXES = 40.0
+"""So many fixes tell a wander: of fewer, any is as likely as another."""
 CLAIM_SHARE = 0.05
 """Of a new fix in the average of what a receiver claims."""
 VERTICAL = 1.0, 2.5
@@ -76,20 +79,21 @@ class ReceiverWanders:
 
     def white_factors(self) -> Matrix:
         """Root mean square ``(n, 3)``, per axis, of the white noise of the fixes over what their receiver claims."""
-        return np.sqrt(self._weights() @ FACTORS**2)[:, [0, 0, 1]]
+        return np.asarray(np.sqrt(self._weights() @ FACTORS**2)[:, [0, 0, 1]])
 
     def _weights(self) -> Matrix:
         """Of the hypotheses ``(n, 2, models)``, horizontal and vertical."""
-        nats = self._nats + np.where((HYPOTHESES_M == WANDERS_M[0]) & (FACTORS >= 1.0), TRUST_NATS, 0.0) * self._watched()
+        trusted = (HYPOTHESES_M[0] == HYPOTHESES_M) & (FACTORS >= 1.0)
+        nats = self._nats + np.where(trusted, TRUST_NATS, 0.0) * self._watched()
         nats -= nats.max(-1, keepdims=True)
         weights = np.exp(nats)
         return np.asarray(weights / weights.sum(-1, keepdims=True))
 
     def _watched(self) -> NDArray[np.float64]:
         """How far ``(n, 1, 1)`` each receiver has been watched, 0..1."""
-        return np.minimum(self._fixes * self._period_s / WATCHED_S, 1.0)[:, None, None]
+        return np.asarray(np.minimum(self._fixes / WATCHED_FIXES, 1.0)[:, None, None])
 
-    def change_members(self, stayed: dict[int, int], agents: int) -> None:
+    def change_members(self, stayed: Mapping[int, int], agents: int) -> None:
         """Go on with another fleet; ``stayed``: by new slot, the old one."""
         before = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
         self._make(agents)

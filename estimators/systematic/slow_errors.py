@@ -1,22 +1,23 @@
 """The slow errors of a fleet's sensors, as constants over a window that its rows and inputs hold.
 
-What lasts for longer than a window is no noise: the wander of a receiver's fixes, of its own and common to all that see
-the same sky; the error of an acceleration by bias and tilt; the bias of the ranges between two antennas. Each is a
-Gauss-Markov process that enters the rows:
+What lasts for longer than a window is no noise: the wander of a receiver's fixes, of its own and common to all that
+see the same sky; the error of an acceleration by bias and tilt; the bias of the ranges between two antennas. Each is
+a Gauss-Markov process that enters the rows:
 
     fix of agent a along u:        + u . w_a + u . w
     range between a and b:         + b_ab
     acceleration of a:             + e_a
 
-Its size follows the data (`estimators.systematic.sizes`). Order of the q errors: wander ``3n``, acceleration ``3n``, common wander ``3``, pairs ``n (n - 1) / 2``.
+Their sizes follow the data (`estimators.systematic.sizes`). Order of the q errors: wander ``3n``, acceleration
+``3n``, common wander ``3``, pairs ``n (n - 1) / 2``. A row with a hard bound has none: its sensor is said to have no
+others.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
@@ -26,10 +27,10 @@ WANDER_S = 60.0
 """Time constant of the wander of fixes."""
 ACCELERATION_S = 20.0
 """Of the error of accelerations in NED: a bias turns with the body, a tilt lasts longer."""
-PAIR_S = 600.0
+PAIR_S = 300.0
 """Of the bias of ranges between two antennas."""
 COUPLED = 7
-"""Slow errors in one row at most."""
+"""Slow errors in one row at most, and one place that ends the list."""
 
 
 def count(agents: int) -> int:
@@ -38,18 +39,23 @@ def count(agents: int) -> int:
 
 
 def wander_of(slot: int) -> slice:
-    """Wander of an agent's fixes."""
+    """Wander of an agent's fixes, NED m."""
     return slice(3 * slot, 3 * slot + 3)
 
 
 def acceleration_of(slot: int, agents: int) -> slice:
-    """Error of an agent's acceleration."""
+    """Error of an agent's acceleration, NED m/s2."""
     return slice(3 * (agents + slot), 3 * (agents + slot) + 3)
 
 
 def common(agents: int) -> slice:
-    """Wander that all fixes share."""
+    """Wander that all fixes share, NED m."""
     return slice(6 * agents, 6 * agents + 3)
+
+
+def pairs(agents: int) -> slice:
+    """Biases of the ranges, m."""
+    return slice(6 * agents + 3, count(agents))
 
 
 def pair_of(one: int, other: int, agents: int) -> int:
@@ -64,11 +70,11 @@ def kept_per_tick(agents: int, period_s: float) -> Vector:
     times[: 3 * agents] = WANDER_S
     times[3 * agents : 6 * agents] = ACCELERATION_S
     times[common(agents)] = WANDER_S
-    times[6 * agents + 3 :] = PAIR_S
+    times[pairs(agents)] = PAIR_S
     return np.exp(-period_s / times)
 
 
-def places_after(before: int, stayed: dict[int, int], after: int) -> IntArray:
+def places_before(before: int, stayed: Mapping[int, int], after: int) -> IntArray:
     """Where each slow error of a changed fleet was, ``(q,)``, -1 for those that begin anew.
 
     ``stayed``: by slot in the new fleet of ``after`` agents, the slot in the old one of ``before``.
@@ -95,7 +101,7 @@ def couplings(rows: RowTable, agents: int) -> tuple[IntArray, Matrix]:
 def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
     for r in range(rows.shape[0]):
         row, j = rows[r], 0
-        if np.isfinite(row["half_width"]):  # a sensor with a hard bound has no other errors
+        if np.isfinite(row["half_width"]):
             continue
         if row["kind"] == POSITION:
             direction = (row["x"], row["y"], row["z"])
@@ -107,3 +113,13 @@ def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
         elif row["kind"] == RANGE:
             a, b = min(row["agent"], row["other"]), max(row["agent"], row["other"])
             at[r, 0], by[r, 0] = 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1, 1.0
+
+
+def corrected_rows(rows: RowTable, at: IntArray, by: Matrix, errors: Vector, variance: Vector) -> RowTable:
+    """Rows less what they hold of the ``errors`` ``(q,)``, less sure by the ``variance`` ``(q,)`` of these."""
+    out = rows.copy()
+    if len(errors):
+        held = at >= 0
+        out["value"] -= np.where(held, by * errors[at], 0.0).sum(axis=1)
+        out["variance"] += np.where(held, by**2 * variance[at], 0.0).sum(axis=1)
+    return out

@@ -1,8 +1,8 @@
 """A window over its first state alone: the exact form of the moving horizon estimator with EKF pre-estimation.
 
 Variables are the state x_0 at the window's start and the slow errors s of its sensors, which are constants over a
-window. The process noise is integrated out: a Kalman filter that starts at x_0 with *zero* covariance runs through the
-window, and its innovations, weighted by their own covariance, are the likelihood of (x_0, s),
+window. The process noise is integrated out: a Kalman filter that starts at x_0 with *zero* covariance runs through
+the window, and its innovations, weighted by their own covariance, are the likelihood of (x_0, s),
 
     e_r = y_r - h(x_k^-) - b_r's,      S_r = R_r + c_r P_k^- c_r',      J = |(x_0, s) - prior|^2 + sum_r e_r^2 / S_r.
 
@@ -219,7 +219,7 @@ def step(window: SlowWindow, found: Sweep, factor: Matrix, path: Matrix, slow: V
         away[i] = window.prior_mean[i] - path[0, i]
     for j in range(slow.shape[0]):
         away[d + j] = window.prior_mean[d + j] - slow[j]
-    change = np.dot(window.prior_information, away) + np.dot(found.innovations, found.gradients)
+    change: Vector = np.dot(window.prior_information, away) + np.dot(found.innovations, found.gradients)
     cholesky_solve(factor, change)
     return change
 
@@ -344,7 +344,7 @@ def minimise(
 
 
 @kernel
-def newest_covariance(window: SlowWindow, found: Sweep, factor: Matrix, out: Matrix) -> None:
+def newest_covariance(found: Sweep, factor: Matrix, out: Matrix) -> None:
     """out ``(D, D)`` <- covariance of the newest state and the slow errors, from a sweep and its normal factor."""
     d, variables = found.sensitivity.shape
     start = np.empty((variables, variables))
@@ -363,12 +363,10 @@ def newest_covariance(window: SlowWindow, found: Sweep, factor: Matrix, out: Mat
 
 
 @kernel
-def marginalise(
-    window: SlowWindow, path: Matrix, slow: Vector, variances: Vector, mean: Vector, covariance: Matrix
-) -> None:
+def marginalise(window: SlowWindow, path: Matrix, variances: Vector, mean: Vector, covariance: Matrix) -> None:
     """mean ``(D,)``, covariance ``(D, D)`` <- the window's prior, in covariance form, with the rows of its first tick.
 
-    ``covariance`` comes in as that of the prior. Rows are linearised at the smoothed ``path`` and ``slow``.
+    ``covariance`` comes in as that of the prior. Rows are linearised at the smoothed ``path``.
     """
     code, data = window.code, window.data
     d, variables = path.shape[1], window.prior_mean.shape[0]
@@ -424,8 +422,9 @@ def predict_moments(window: SlowWindow, keep: Vector, added: Vector, mean: Vecto
 
 
 @entry(
-    "Tuple((int64, int64, float64))(SLOW_WINDOW, ROW[::1], float64[::1], float64[::1], boolean, int64, float64, float64[:, ::1],"
-    " float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
+    "Tuple((int64, int64, float64))(SLOW_WINDOW, ROW[::1], float64[::1], float64[::1], boolean, int64, float64,"
+    " float64[:, ::1],"
+    " float64[::1], float64[::1], float64[::1], float64[:, ::1], float64[::1], float64[:, ::1])",
     SLOW_WINDOW=SLOW_WINDOW,
     ROW=ROW,
 )
@@ -439,6 +438,7 @@ def solve_first_state(
     tolerance: float,
     path: Matrix,
     slow: Vector,
+    measured: Vector,
     variances: Vector,
     newest: Matrix,
     mean: Vector,
@@ -446,28 +446,30 @@ def solve_first_state(
 ) -> tuple[int, int, float]:
     """Optimum of a window, the covariance of its newest state, and the prior of the window that follows.
 
-    ``path`` ``(N+1, d)`` and ``slow`` ``(q,)`` come in as the start of the iteration and go out as the optimum;
-    ``variances`` ``(m,)`` get those of the rows as they were used: weighted, and with what a linearisation misses.
+    ``keep``, ``added``: see `predict_moments`. ``path`` ``(N+1, d)`` and ``slow`` ``(q,)`` come in as the start of
+    the iteration and go out as the optimum;
+    ``measured`` ``(m,)`` get the variances of the rows by their weights, ``variances`` these with what a linearisation
+    misses.
     ``newest`` ``(D, D)`` gets the covariance of the newest state and the slow errors. ``covariance`` ``(D, D)`` comes
     in as that of the window's prior; with ``slide``, it and ``mean`` ``(D,)`` go out as the prior of a window that
     starts one tick later. Gives the outcome, the iterations and the objective.
     """
     window = SlowWindow(*window)
-    d, variables = path.shape[1], window.prior_mean.shape[0]
+    variables = window.prior_mean.shape[0]
     outcome, iterations, value = minimise(window, path, slow, variances, max_iterations, tolerance)
     if outcome == UNUSABLE:
         return outcome, iterations, value
     factor = np.empty((variables, variables))
-    measured = variances.copy()
+    measured[:] = variances
     for _ in range(REWEIGHTINGS + 1):
         found = sweep(window, path, slow, variances)
         if not normal_factor(window, found, factor):
             return UNUSABLE, iterations, value
-        newest_covariance(window, found, factor, newest)
+        newest_covariance(found, factor, newest)
         if not add_missed(window, rows, path, newest, measured, variances):
             break
     if slide:
-        marginalise(window, path, slow, variances, mean, covariance)
+        marginalise(window, path, variances, mean, covariance)
         predict_moments(window, keep, added, mean, covariance)
     if not (np.isfinite(path).all() and np.isfinite(newest).all() and np.isfinite(covariance).all()):
         return UNUSABLE, iterations, value

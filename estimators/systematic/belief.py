@@ -1,0 +1,101 @@
+"""A belief about a fleet's state and the slow errors of its sensors, at one tick: the arrival cost of a window."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Self
+
+import numpy as np
+
+from estimators.model.gaussian import Pair, symmetrised
+from estimators.model.layout import block, states_of
+from estimators.model.measurements import Matrix, Vector
+from estimators.model.members import InformationState, MemberChange
+from estimators.systematic.slow_errors import places_before
+
+WORTHWHILE = 1.02
+"""A size that has changed by less than this factor is left what it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class SlowBelief:
+    """Mean ``(D,)`` and covariance ``(D, D)`` of ``6n`` states, NED m and m/s, followed by q slow errors."""
+
+    mean: Vector
+    covariance: Matrix
+    sizes: Vector
+    """``(q,)``: the priors that the slow errors have had."""
+
+    @classmethod
+    def first(cls, mean: Vector, covariance: Matrix, sizes: Vector) -> Self:
+        """From a prior of the states alone."""
+        states, total = len(mean), len(mean) + len(sizes)
+        whole = np.zeros((total, total))
+        whole[:states, :states] = covariance
+        whole[range(states, total), range(states, total)] = sizes**2
+        return cls(np.concatenate((mean, np.zeros(len(sizes)))), whole, sizes.copy())
+
+    @property
+    def states(self) -> int:
+        """How many states there are, ``6n``."""
+        return len(self.mean) - len(self.sizes)
+
+    def kinematic(self) -> InformationState:
+        """The states alone; raises ``numpy.linalg.LinAlgError`` where their covariance is singular."""
+        d = self.states
+        return InformationState.from_moments(self.mean[:d], self.covariance[:d, :d])
+
+    def with_pair(self, own: Pair, pair: Pair) -> SlowBelief:
+        """The belief whose states are those of ``pair`` instead of those of ``own``, its present ones.
+
+        What the states say of the slow errors stays what it was: p(x, s) = p_pair(x) p_own(s | x).
+        """
+        d, information = self.states, np.linalg.inv(self.covariance)
+        vector = information @ self.mean
+        information[:d, :d] += pair[0] - own[0]
+        vector[:d] += pair[1] - own[1]
+        covariance = symmetrised(np.linalg.inv(information))
+        return replace(self, mean=covariance @ vector, covariance=covariance)
+
+    def with_states(self, mean: Vector, covariance: Matrix) -> SlowBelief:
+        """The belief with other states, which say nothing of the slow errors."""
+        d = self.states
+        fresh = SlowBelief.first(mean, covariance, self.sizes)
+        fresh.mean[d:], fresh.covariance[d:, d:] = self.mean[d:], self.covariance[d:, d:]
+        return fresh
+
+    def resized(self, sizes: Vector) -> SlowBelief:
+        """With priors of other sizes.
+
+        A larger one adds the difference of the variances, a smaller one the difference of the informations: where
+        nothing was measured, the slow error has the new prior.
+        """
+        mean, covariance, known = self.mean.copy(), self.covariance.copy(), self.sizes.copy()
+        for j in np.flatnonzero((sizes > WORTHWHILE * known) | (sizes < known / WORTHWHILE)):
+            at, before, after = self.states + j, known[j] ** 2, sizes[j] ** 2
+            if after > before:
+                covariance[at, at] += after - before
+            else:
+                column = covariance[:, at].copy()
+                total = column[at] + 1.0 / (1.0 / after - 1.0 / before)
+                mean -= column * (mean[at] / total)
+                covariance -= np.outer(column, column) / total
+            known[j] = sizes[j]
+        return SlowBelief(mean, covariance, known)
+
+    def reindexed(self, change: MemberChange, sizes: Vector) -> SlowBelief:
+        """The belief about the fleet after a change; ``sizes``: those of its slow errors where they begin anew."""
+        states = change.after.dimension
+        was = np.full(states, -1, np.int64)
+        was[states_of(list(change.stayed))] = states_of(list(change.stayed.values()))
+        if len(sizes):
+            slow = places_before(change.before.size, change.stayed, change.after.size)
+            was = np.concatenate((was, np.where(slow >= 0, self.states + slow, -1)))
+            sizes = np.where(slow >= 0, self.sizes[slow], sizes)
+        made = SlowBelief.first(np.zeros(states), np.eye(states), sizes)
+        kept = np.flatnonzero(was >= 0)
+        made.mean[kept] = self.mean[was[kept]]
+        made.covariance[np.ix_(kept, kept)] = self.covariance[np.ix_(was[kept], was[kept])]
+        for slot, (mean, covariance) in change.fresh.items():
+            made.mean[block(slot)], made.covariance[block(slot), block(slot)] = mean, covariance
+        return made

@@ -7,8 +7,8 @@ with its own hypothesis of the wander's size and of the white noise,
     state  p, v, e (error of the acceleration), w (wander, Gauss-Markov),    fix = p + w + white noise,
 
 and the likelihood of what was measured weighs the hypotheses (multiple-model adaptive estimation, D. T. Magill,
-1965). Horizontal axes have one size, the vertical one its own. What a receiver claims is its whole error: where its white
-noise is less, the rest is wander.
+1965). Horizontal axes have one size, the vertical one its own. What a receiver claims is its whole error: where its
+white noise is less, the rest is wander.
 """
 
 from __future__ import annotations

@@ -364,7 +364,7 @@ def newest_covariance(found: Sweep, factor: Matrix, out: Matrix) -> None:
 
 @kernel
 def marginalise(window: SlowWindow, path: Matrix, variances: Vector, mean: Vector, covariance: Matrix) -> None:
-    """mean ``(D,)``, covariance ``(D, D)`` <- the window's prior, in covariance form, with the rows of its first tick.
+    """mean ``(D,)``, covariance ``(D, D)`` <- the window's prior, in covariance form, with its first tick's rows.
 
     ``covariance`` comes in as that of the prior. Rows are linearised at the smoothed ``path``.
     """
@@ -448,8 +448,8 @@ def solve_first_state(
 
     ``keep``, ``added``: see `predict_moments`. ``path`` ``(N+1, d)`` and ``slow`` ``(q,)`` come in as the start of
     the iteration and go out as the optimum;
-    ``measured`` ``(m,)`` get the variances of the rows by their weights, ``variances`` these with what a linearisation
-    misses.
+    ``measured`` ``(m,)`` get the variances of the rows by their weights, ``variances`` these with what a
+    linearisation misses.
     ``newest`` ``(D, D)`` gets the covariance of the newest state and the slow errors. ``covariance`` ``(D, D)`` comes
     in as that of the window's prior; with ``slide``, it and ``mean`` ``(D,)`` go out as the prior of a window that
     starts one tick later. Gives the outcome, the iterations and the objective.

@@ -63,7 +63,7 @@ def slow_problem(
     agents = belief.states // 6
     code, data = np.empty((len(rows), 3), np.int64), np.empty((len(rows), 7))
     group = np.empty(len(rows), np.int64)
-    _encode(rows, agents, np.clip(white, *WHITE), code, data, group)
+    _encode(rows, agents, np.ascontiguousarray(np.clip(white, *WHITE)), code, data, group)
     if len(belief.sizes):
         at, by = slow_errors.couplings(rows, agents)
         push_at, push_by = np.arange(3 * agents, 6 * agents), np.ones(3 * agents)

@@ -43,6 +43,8 @@ REWEIGHTINGS = 3
 """How often the covariance and what the linearisation misses at it are computed from each other."""
 SHORTEST_STEP = 1.0 / 64.0
 """A step that has to be cut further is none."""
+SLOW = 0.3
+"""Contraction from one step to the next above which the length of the step is looked for."""
 ROUNDING = 1e-10
 """Relative change of the objective that counts as none."""
 EXPECTED_CONTRACTION_M = 1.0
@@ -326,21 +328,48 @@ def minimise(
         size = max(np.abs(trial - path).max(), 0.0)
         if not np.isfinite(size):
             return UNUSABLE, iteration, value
-        share = 1.0
-        new = objective(window, trial, there, trial_variances)
-        while not new <= value + ROUNDING * (1.0 + abs(value)) and share > SHORTEST_STEP:
-            share *= 0.5
-            trial[:] = path + 0.5 * (trial - path)
-            there[:] = slow + 0.5 * (there - slow)
-            new = objective(window, trial, there, trial_variances)
+        _, new = _shared_step(window, path, slow, trial, there, trial_variances, value, size > SLOW * last)
         if not new <= value + ROUNDING * (1.0 + abs(value)):
             return (CONVERGED if size < tolerance else NOT_CONVERGED), iteration + 1, value
         path[:], slow[:], variances[:] = trial, there, trial_variances
         value = new
-        if share == 1.0 and size * min(size / last, 1.0) < tolerance:
+        if size * min(size / last, 1.0) < tolerance:
             return CONVERGED, iteration + 1, value
-        last = size * share
+        last = size
     return NOT_CONVERGED, max_iterations, value
+
+
+@kernel
+def _shared_step(
+    window: SlowWindow,
+    path: Matrix,
+    slow: Vector,
+    trial: Matrix,
+    there: Vector,
+    variances: Vector,
+    value: float,
+    slowly: bool,
+) -> tuple[float, float]:
+    """``trial`` ``(N+1, d)``, ``there`` ``(q,)`` <- as much of the step to them from ``path``, ``slow`` as pays.
+
+    Where steps contract ``slowly`` they overshoot along a bend, or creep: then the lowest point of the parabola
+    through the objective at the start, in the middle and at the end is tried. Gives the share that was taken and the
+    objective there; ``value`` is that at the start, and what is not below it means that no share was found.
+    """
+    full, full_slow = trial.copy(), there.copy()
+    new, share = objective(window, trial, there, variances), 1.0
+    if slowly:
+        trial[:], there[:] = 0.5 * (path + full), 0.5 * (slow + full_slow)
+        middle = objective(window, trial, there, variances)
+        bend = 2.0 * (new - 2.0 * middle + value)
+        share = min(max((3.0 * value - 4.0 * middle + new) / (2.0 * bend), SHORTEST_STEP), 2.0) if bend > 0.0 else 1.0
+        trial[:], there[:] = path + share * (full - path), slow + share * (full_slow - slow)
+        new = objective(window, trial, there, variances)
+    while not new <= value + ROUNDING * (1.0 + abs(value)) and share > SHORTEST_STEP:
+        share *= 0.5
+        trial[:], there[:] = path + share * (full - path), slow + share * (full_slow - slow)
+        new = objective(window, trial, there, variances)
+    return share, new
 
 
 @kernel

@@ -25,10 +25,13 @@ from estimators.systematic.slow_errors import ACCELERATION_S, WANDER_S
 
 WANDERS_M = np.array([0.02, 0.15, 0.4, 0.8, 1.6, 4.0])
 """Standard deviations of the wander per axis."""
+PRIOR = np.array([0.32, 0.25, 0.2, 0.14, 0.07, 0.02])
+"""Probability of each before any evidence."""
 WHITES = np.array([0.35, 0.6, 1.0, 2.0])
 """What the white noise of the fixes is, of what the receiver claims."""
 HYPOTHESES_M, FACTORS = np.tile(WANDERS_M, len(WHITES)), np.repeat(WHITES, len(WANDERS_M))
 """All pairs of the two."""
+PRIOR_NATS = np.tile(np.log(PRIOR), len(WHITES))
 MEMORY_FIXES = 300.0
 """Fixes that are remembered, some minute of them."""
 TRUST_NATS = 5.0
@@ -84,7 +87,7 @@ class ReceiverWanders:
     def _weights(self) -> Matrix:
         """Of the hypotheses ``(n, 2, models)``, horizontal and vertical."""
         trusted = (HYPOTHESES_M[0] == HYPOTHESES_M) & (FACTORS >= 1.0)
-        nats = self._nats + np.where(trusted, TRUST_NATS, 0.0) * self._watched()
+        nats = self._nats + PRIOR_NATS + np.where(trusted, TRUST_NATS, 0.0) * self._watched()
         nats -= nats.max(-1, keepdims=True)
         weights = np.exp(nats)
         return np.asarray(weights / weights.sum(-1, keepdims=True))

@@ -24,7 +24,7 @@ PAIR_M = 0.3, 0.03, 0.6
 PAIR_OF_WANDER = 0.5
 """Where receivers wander, ranges cannot tell their bias from the places of their ends: it is taken to be so much of
 the wander at least, but no more than at the start."""
-ACCEL_MPS2 = 0.3, 0.02, 1.0
+ACCEL_MPS2 = 0.15, 0.02, 1.0
 """The same of the error of an acceleration."""
 MEMORY_S = 3.0
 """Of the second moments."""

@@ -375,6 +375,7 @@ class AgentCore:
             Ages(
                 fix_age_s=fix_age_s,
                 imu_coverage=0.0 if self._input is None else self._input.coverage,
+                aided=self._input is None or self._input.aided,
                 heard_age_s=self.neighbours.expected_ages_s(now_s),
             ),
             autopilot=self._link_state,

@@ -38,6 +38,10 @@ StampS = Callable[[float, float], float | None]
 """(boot time, arrival) to fleet time in s; ``None`` if it cannot be told."""
 
 
+_AIDED = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
+"""Flags of which an aided estimator has one: they go at once with the fix, those of its estimate after seconds."""
+
+
 class SampleAdapter:
     """The samples of one autopilot.
 
@@ -59,6 +63,8 @@ class SampleAdapter:
         RAW_IMU, and the sensors of each are late in their own way."""
         self.fix_type = 0
         """The receiver's last word on its fix."""
+        self.aided = True
+        """Whether the autopilot's own estimator is aided by positions, by its last word."""
         self.skipped: Counter[str] = Counter()
 
     def reset(self) -> None:
@@ -66,6 +72,7 @@ class SampleAdapter:
         self._last_preferred_s.clear()
         self._last_fix = None
         self.fix_type = 0
+        self.aided = True
 
     def convert(self, message: Message, arrival_s: float) -> Sample | None:
         """The sample of a message that arrived at fleet time ``arrival_s``; ``None`` if it gives none."""
@@ -112,7 +119,7 @@ class SampleAdapter:
             return self._skip("attitude: no unit quaternion")
         self._last_preferred_s["attitude"] = arrival_s
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
-        return None if t_s is None else AttitudeSample(t_s, quaternion)
+        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
 
     def _attitude(self, message: Message, arrival_s: float) -> Sample | None:
         if not self._is_second_choice_due("attitude", arrival_s):
@@ -121,7 +128,12 @@ class SampleAdapter:
             return self._skip("attitude: not finite")
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
         quaternion = from_euler(message.roll, message.pitch, message.yaw)
-        return None if t_s is None else AttitudeSample(t_s, quaternion)
+        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
+
+    def _estimator_status(self, message: Message, _arrival_s: float) -> Sample | None:
+        """ESTIMATOR_STATUS and EKF_STATUS_REPORT have the same flags for what is asked here."""
+        self.aided = bool(message.flags & _AIDED) and not message.flags & mavlink.ESTIMATOR_CONST_POS_MODE
+        return None
 
     # --- GPS -----------------------------------------------------------------------------------------------
 
@@ -236,4 +248,6 @@ _CONVERTERS: dict[int, Callable[[SampleAdapter, Message, float], Sample | None]]
     mavlink.MAVLINK_MSG_ID_ATTITUDE: SampleAdapter._attitude,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: SampleAdapter._gps_raw_int,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: SampleAdapter._local_position_ned,
+    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: SampleAdapter._estimator_status,
+    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: SampleAdapter._estimator_status,
 }

@@ -60,6 +60,7 @@ _TEXTS = {
     What.CONTRADICTORY: "no place explains the measurements",
     What.AUTOPILOT: "autopilot {0.detail}",
     What.IMU_GAP: "IMU incomplete",
+    What.UNAIDED: "attitude without aiding",
     What.NO_FIX: "no GPS",
     What.SILENT: "not heard: {0}",
     What.LATENCY: "latency of GPS not known",

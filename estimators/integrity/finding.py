@@ -51,6 +51,8 @@ class What(Enum):
     """The link to the autopilot is not there."""
     IMU_GAP = auto()
     """The IMU was silent for a part of the tick."""
+    UNAIDED = auto()
+    """The autopilot's attitude is that of an estimator without positions: it tilts."""
     NO_FIX = auto()
     """No position fix of late."""
     SILENT = auto()

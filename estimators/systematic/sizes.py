@@ -12,6 +12,8 @@ import numpy as np
 
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
+from estimators.model.row_kernels import POSITION
+from estimators.model.unknown_motion import TILTED_MPS2
 from estimators.systematic import slow_errors
 from estimators.systematic.receiver_wander import ReceiverWanders
 
@@ -26,6 +28,8 @@ PAIR_OF_WANDER = 0.5
 the wander at least, but no more than at the start."""
 ACCEL_MPS2 = 0.15, 0.02, 1.0
 """The same of the error of an acceleration."""
+LOST_S = 1.0
+"""Without fixes for longer, an autopilot's attitude is taken for that of an estimator without aiding."""
 MEMORY_S = 3.0
 """Of the second moments."""
 
@@ -38,6 +42,9 @@ class SystematicSizes:
         self._wanders = ReceiverWanders(agents, period_s)
         self._pair_m = PAIR_M[0]
         self._accel_mps2 = np.full(agents, ACCEL_MPS2[0])
+        self._lost_ticks = np.zeros(agents, np.int64)
+        """Since the last fix that left the window."""
+        self._most_ticks = round(LOST_S / period_s)
 
     def learn(self, rows: RowTable, accel: Vector, accel_variance: Vector, errors: Vector, variance: Vector) -> None:
         """Take in a tick that leaves the window: its rows, its accelerations ``(3n,)`` and their variances.
@@ -45,6 +52,8 @@ class SystematicSizes:
         ``errors``, ``variance`` ``(q,)``: the slow errors as they are estimated now.
         """
         self._wanders.weigh(rows, accel, accel_variance)
+        self._lost_ticks += 1
+        self._lost_ticks[rows["agent"][rows["kind"] == POSITION]] = 0
         agents, moments = len(self._accel_mps2), errors**2 + variance
         accelerations = moments[3 * agents : 6 * agents].reshape(agents, 3).mean(axis=1)
         mixed = (1.0 - self._share) * self._accel_mps2**2 + self._share * accelerations
@@ -62,7 +71,9 @@ class SystematicSizes:
         shared = COMMON_SHARE * np.median(wander, axis=0) if agents > 1 else np.zeros(3)
         out = np.empty(slow_errors.count(agents))
         out[: 3 * agents] = np.sqrt(np.maximum(wander - shared, OWN_SHARE * wander)).ravel()
-        out[3 * agents : 6 * agents] = np.repeat(self._accel_mps2, 3)
+        tilted = np.where(self._lost_ticks > self._most_ticks, TILTED_MPS2, 0.0)
+        across = np.maximum(self._accel_mps2, tilted)
+        out[3 * agents : 6 * agents] = np.stack((across, across, self._accel_mps2), axis=1).ravel()
         out[slow_errors.common(agents)] = np.sqrt(np.maximum(shared, 1e-6))
         out[slow_errors.pairs(agents)] = self._pair_m
         return out
@@ -78,3 +89,5 @@ class SystematicSizes:
         self._accel_mps2 = np.array(
             [self._accel_mps2[known[slot]] if slot in known else ACCEL_MPS2[0] for slot in range(change.after.size)]
         )
+        lost = self._lost_ticks
+        self._lost_ticks = np.array([lost[known[s]] if s in known else 0 for s in range(change.after.size)])

@@ -96,7 +96,7 @@ class Timeline:
             return TickInput(tick, (0.0, 0.0, 0.0), (spread, spread, spread), 0.0, 0)
         coverage = min(covered_s / self._period_s, 1.0)
         uncovered = 1.0 - coverage if 1.0 - coverage > TICK_ROUNDING else 0.0
-        aided = all(sample.aided for sample in self._attitudes if sample.t_s >= start_s)
+        aided = all(sample.aided for sample in self._attitudes if start_s <= sample.t_s < end_s)
         tilted = 0.0 if aided else TILTED_MPS2**2
         variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2 + tilted
         north, east, down = (component / covered_s for component in integral)

@@ -224,3 +224,36 @@ def test_raw_imu_scales_every_integer(x: int, y: int, z: int) -> None:
 
 def test_the_frame_comes_from_the_configuration(make_config: Callable[..., FleetConfig]) -> None:
     assert FleetFrame.of(make_config()) == FRAME
+
+
+AIDED, JUST_LOST, WITHOUT_POSITION = 0b1101111111, 0b0001111111, 0b0001100101
+"""Flags of a PX4 in flight: with fixes, at once after the last one, and four seconds later."""
+
+
+def estimator_status(flags: int, ardupilot: bool) -> Any:
+    if ardupilot:
+        return mavlink.MAVLink_ekf_status_report_message(flags, 0.1, 0.1, 0.1, 0.1, 0.0)
+    return mavlink.MAVLink_estimator_status_message(100_000_000, flags, 0.1, 0.1, 0.1, 0.1, 0.0, 0.0, 0.3, 0.3)
+
+
+@pytest.mark.parametrize("ardupilot", [False, True])
+@pytest.mark.parametrize(("flags", "aided"), [(AIDED, True), (JUST_LOST, False), (WITHOUT_POSITION, False)])
+def test_an_attitude_says_whether_the_autopilot_is_aided_by_positions(
+    flags: int, aided: bool, ardupilot: bool
+) -> None:
+    made = adapter(ardupilot)
+    attitude = mavlink.MAVLink_attitude_quaternion_message(99_990, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    before = convert(made, attitude)
+    assert convert(made, estimator_status(flags, ardupilot)) is None
+    after = convert(made, attitude)
+
+    assert before.aided
+    assert after.aided is aided
+
+
+def test_after_a_reboot_its_last_word_on_that_is_forgotten() -> None:
+    made = adapter()
+    convert(made, estimator_status(WITHOUT_POSITION, False))
+    made.reset()
+    attitude = mavlink.MAVLink_attitude_quaternion_message(99_990, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert convert(made, attitude).aided

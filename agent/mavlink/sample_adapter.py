@@ -26,6 +26,11 @@ UNIX_US = 10**15
 """A ``time_usec`` above this is Unix time (after 2001), below it time since boot."""
 GPS_SIGMA_FLOOR_M = 0.02
 """Least 1-sigma of a fix, whatever the receiver claims: RTK is no better than its antenna's phase centre."""
+FROZEN_FIXES = 3
+"""A fix that has come so often in a row, to the last digit of position and velocity, is no new measurement."""
+MOVING_MPS = 0.5
+"""Above it a fix that repeats contradicts its own velocity: its next one is many of its digits away. A receiver at
+rest may say the same for long, as some filter their output."""
 GPS_SPEED_SIGMA_MPS = 0.3
 """Where the receiver does not report a speed accuracy."""
 GPS_RANGE_ERROR_M = 2.5
@@ -57,7 +62,10 @@ class SampleAdapter:
         self._epoch_unix_s = epoch_unix_s
         self._fleet_time_of_boot = fleet_time_of_boot
         self._last_preferred_s: dict[str, float] = {}
-        self._last_fix: tuple[int, int, int, int] | None = None
+        self._last_fix: tuple[int, ...] = ()
+        """Time, place and velocity, as sent."""
+        self._repeats = 0
+        """How often the last fix has come again, with another time."""
         self.flavour = "other"
         """``ardupilot``, ``px4`` or ``other``, set by the owner once the autopilot is known: only ArduPilot scales
         RAW_IMU, and the sensors of each are late in their own way."""
@@ -65,12 +73,14 @@ class SampleAdapter:
         """The receiver's last word on its fix."""
         self.aided = True
         """Whether the autopilot's own estimator is aided by positions, by its last word."""
+        self.frozen = False
+        """Whether the receiver repeats a fix that its own velocity contradicts."""
         self.skipped: Counter[str] = Counter()
 
     def reset(self) -> None:
         """Forget the streams seen, as after a reboot."""
         self._last_preferred_s.clear()
-        self._last_fix = None
+        self._last_fix, self._repeats, self.frozen = (), 0, False
         self.fix_type = 0
         self.aided = True
 
@@ -141,10 +151,11 @@ class SampleAdapter:
         self.fix_type = message.fix_type
         if not self._sensors.gps_min_fix <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP:
             return self._skip("gps: no fix")
-        fix = (message.time_usec, message.lat, message.lon, message.alt)
+        fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
         if message.time_usec and fix == self._last_fix:
             return self._skip("gps: sent again")
-        self._last_fix = fix
+        if self._is_frozen(fix, message):
+            return self._skip("gps: frozen")
         if not (abs(message.lat) <= 900_000_000 and abs(message.lon) <= 1_800_000_000) or (
             message.lat == 0 and message.lon == 0
         ):
@@ -172,6 +183,14 @@ class SampleAdapter:
             fix_type=message.fix_type,
             latency=gps_prior(self.flavour, _stamp_kind(message.time_usec), self._sensors),
         )
+
+    def _is_frozen(self, fix: tuple[int, ...], message: Message) -> bool:
+        """Whether the receiver repeats itself though it says that it moves; remembers the fix."""
+        self._repeats = self._repeats + 1 if fix[1:] == self._last_fix[1:] else 0
+        self._last_fix = fix
+        moves = message.vel != UNKNOWN_16 and message.vel * 1e-2 > MOVING_MPS
+        self.frozen = moves and self._repeats >= FROZEN_FIXES - 1
+        return self.frozen
 
     def _accuracy_m(self, accuracy_mm: int, dilution_centi: int) -> float | None:
         """1-sigma in m: the receiver's own, else from the dilution of precision (which is not metres).

@@ -58,6 +58,8 @@ _TEXTS = {
     What.ELSEWHERE: "position moved to another place",
     What.REVERSED: "fleet turned to its mirror image",
     What.CONTRADICTORY: "no place explains the measurements",
+    What.FIXES_CONTRADICT: "{0.detail} contradict the rest",
+    What.FIXES_IGNORED: "{0.detail} contradict the rest, not used",
     What.AUTOPILOT: "autopilot {0.detail}",
     What.IMU_GAP: "IMU incomplete",
     What.UNAIDED: "attitude without aiding",

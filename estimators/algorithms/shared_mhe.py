@@ -14,7 +14,7 @@ with what its linearisation misses (`estimators.model.second_order`), and monito
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
@@ -22,6 +22,8 @@ from estimators.algorithms.shared_monitors import Belief, SharedMonitors
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, SolverReport, Status
 from estimators.integrity.ambiguity import Body, body_of
+from estimators.integrity.finding import Finding, What
+from estimators.integrity.innovations import InnovationMonitor
 from estimators.model.gaussian import Pair, Prior, symmetrised
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
@@ -34,7 +36,14 @@ from estimators.systematic.slow_errors import corrected_rows
 from estimators.window.arrival_cost import first_estimate
 from estimators.window.assembly import open_window
 from estimators.window.problem import WindowProblem
-from estimators.window.slow_window import SlowProblem, SlowSolution, continued, slow_problem, solve_slow
+from estimators.window.slow_window import (
+    SlowProblem,
+    SlowSolution,
+    continued,
+    leaving_residuals,
+    slow_problem,
+    solve_slow,
+)
 
 
 class SharedMovingHorizonEstimator:
@@ -69,6 +78,7 @@ class SharedMovingHorizonEstimator:
         self._last: SlowSolution | None = None
         """Of the tick before, to start from."""
         self._consensus = Inheritance(slot)
+        self._innovations = InnovationMonitor(layout.size, slot, period_s)
         self._monitors = SharedMonitors(
             layout, slot, body_of(mean, covariance, slot), period_s, settings.norm_smoothing_m
         )
@@ -99,10 +109,14 @@ class SharedMovingHorizonEstimator:
         """The states of the own arrival cost, with what was inherited in ``round_`` rounds."""
         return self._consensus.outgoing()
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
-        """Inherit from each neighbour's pair what it knows better; nothing at the very first tick."""
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
+        """Inherit from each neighbour's pair what it knows better; nothing at the very first tick.
+
+        Gives whose pair does not fit the own one (`estimators.consensus.inheritance`).
+        """
         for slot in self._consensus.mix(received, fuse=self.window.begun):
             self.window.hear(slot, self.window.first)
+        return self._consensus.disbelieved
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Solve the window, filter it for the next arrival cost, and let the monitors look at both."""
@@ -113,11 +127,16 @@ class SharedMovingHorizonEstimator:
             self.belief = self.belief.with_pair(self._own, pair)
         problem, solution = self._solved(budget)
         self._learn(problem, solution)
+        contradictions = self._contradictions(problem, solution)
         states = self.belief.states
         covariance = symmetrised(solution.covariance[:states, :states])
         belief = Belief(solution.path, covariance, solution.arrival.kinematic())
         rows, measured = self._seen(problem, solution)
         verdict = self._monitors.look(rows, measured, belief, slide=self.window.full)
+        observable = verdict.observable
+        for finding in contradictions:
+            if finding.what is What.FIXES_CONTRADICT:
+                observable[finding.about] = False
         self.belief, self._last = solution.arrival, solution
         if verdict.moves:
             moved = verdict.belief.arrival
@@ -126,10 +145,12 @@ class SharedMovingHorizonEstimator:
             self.window.last,
             verdict.belief.path[-1],
             verdict.belief.covariance,
-            self._status(solution.converged, len(problem.rows) > 0, bool(verdict.observable[self.slot])),
+            self._status(solution.converged, len(problem.rows) > 0, bool(observable[self.slot])),
             self.window.ages(),
             SolverReport(iterations=solution.iterations, cost=solution.cost, moves=verdict.moves),
-            verdict.observable,
+            observable,
+            contradictions,
+            self._innovations.averages(),
         )
 
     def _solved(self, budget: int | None) -> tuple[SlowProblem, SlowSolution]:
@@ -139,7 +160,13 @@ class SharedMovingHorizonEstimator:
         if self._sizes is not None:
             self.belief, white = self.belief.resized(self._present_sizes()), self._sizes.white_factors()
         problem = slow_problem(
-            self.window, self.belief, white, self.period_s, settings.norm_smoothing_m, robust=settings.robust
+            self.window,
+            self.belief,
+            white,
+            self.period_s,
+            settings.norm_smoothing_m,
+            robust=settings.robust,
+            ignored=self._innovations.ignored,
         )
         path, slow = self.belief.mean[None, : self.belief.states], self.belief.mean[self.belief.states :]
         if self._last is not None:
@@ -158,6 +185,13 @@ class SharedMovingHorizonEstimator:
         window, states = problem.window, self.belief.states
         leaving, variance = problem.rows[: window.start[1]], solution.covariance.diagonal()[states:]
         self._sizes.learn(leaving, window.accel[0], window.accel_variance[0], solution.slow, variance)
+
+    def _contradictions(self, problem: SlowProblem, solution: SlowSolution) -> tuple[Finding, ...]:
+        """Whose fixes do not fit the rest, as the rows that leave the window say."""
+        if not (self.settings.robust and self.window.full):
+            return ()
+        monitor = self._innovations
+        return monitor.observe(leaving_residuals(problem, solution, monitor.ignored))
 
     def _seen(self, problem: SlowProblem, solution: SlowSolution) -> tuple[WindowProblem, RowTable]:
         """The window as the monitors see it, less its slow errors, and its rows without what linearisations miss."""
@@ -198,6 +232,7 @@ class SharedMovingHorizonEstimator:
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)
         self._consensus.change_members(change)
+        self._innovations.change_members(change)
         prior = change.fresh.get(self.slot)
         self._monitors.change_members(change, None if prior is None else self._at_last_tick(prior))
 

@@ -8,16 +8,37 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, plain
+from estimators.integrity.innovations import Residuals
+from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.motion import predict_mean
-from estimators.model.row_kernels import HALF_WIDTH, POSITION, PRECISION, VELOCITY, IntArray, encode_rows
+from estimators.model.row_kernels import (
+    HALF_WIDTH,
+    POSITION,
+    PRECISION,
+    SPEED,
+    VALUE,
+    VELOCITY,
+    IntArray,
+    encode_rows,
+    predict_row,
+)
 from estimators.systematic import slow_errors
 from estimators.systematic.belief import SlowBelief
-from estimators.window.first_state import CONVERGED, UNUSABLE, SlowWindow, solve_first_state
+from estimators.window.first_state import (
+    CONVERGED,
+    SLOW_WINDOW,
+    UNUSABLE,
+    SlowWindow,
+    slow_part,
+    solve_first_state,
+)
 from estimators.window.history import MeasurementWindow
 
 WHITE = 0.4, 3.0
 """What the white noise of fixes is taken to be of what their receiver claims, at least and at most."""
+IGNORED_FACTOR = 1e-8
+"""On the information of rows that are to get no weight: a fix of a metre is one of 10 km."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,9 +72,18 @@ class SlowSolution:
 
 
 def slow_problem(
-    window: MeasurementWindow, belief: SlowBelief, white: Matrix, period_s: float, eps: float, *, robust: bool
+    window: MeasurementWindow,
+    belief: SlowBelief,
+    white: Matrix,
+    period_s: float,
+    eps: float,
+    *,
+    robust: bool,
+    ignored: NDArray[np.bool_] | None = None,
 ) -> SlowProblem:
     """The problem of a window with a belief about its start; ``white`` ``(n, 3)``: see `SystematicSizes`.
+
+    ``ignored`` ``(n,)``: whose fixes and velocities get no weight; absent = nobody's.
 
     Raises ``numpy.linalg.LinAlgError`` where the belief's covariance is singular.
     """
@@ -64,6 +94,8 @@ def slow_problem(
     code, data = np.empty((len(rows), 3), np.int64), np.empty((len(rows), 7))
     group = np.empty(len(rows), np.int64)
     _encode(rows, agents, np.ascontiguousarray(np.clip(white, *WHITE)), code, data, group)
+    if ignored is not None and ignored.any():
+        data[ignored_rows(rows, ignored), PRECISION] *= IGNORED_FACTOR
     if len(belief.sizes):
         at, by = slow_errors.couplings(rows, agents)
         push_at, push_by = np.arange(3 * agents, 6 * agents), np.ones(3 * agents)
@@ -144,3 +176,50 @@ def continued(path: Matrix, problem: SlowProblem, slow: Vector) -> Matrix:
 def weights(problem: SlowProblem, solution: SlowSolution) -> NDArray[np.float64]:
     """The weight ``(m,)`` of each row: one, or less for an outlier."""
     return np.asarray(1.0 / (problem.window.data[:, PRECISION] * solution.measured))
+
+
+def ignored_rows(rows: RowTable, ignored: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Which rows ``(m,)`` are fixes and velocities of agents that are ``ignored`` ``(n,)``."""
+    receiver = np.isin(rows["kind"], (POSITION, VELOCITY, SPEED))
+    return np.asarray(receiver & ignored[rows["agent"]])
+
+
+def leaving_residuals(problem: SlowProblem, solution: SlowSolution, ignored: NDArray[np.bool_]) -> Residuals:
+    """The rows of the window's first tick, which have been weighed for good, against its solution.
+
+    Those of ``ignored`` agents ``(n,)`` are held against the estimate without them: its variance counts too.
+    """
+    window, count = problem.window, int(problem.window.start[1])
+    rows, precision = problem.rows[:count], window.data[:count, PRECISION]
+    residuals = np.empty(count)
+    _residuals(plain(window), solution.path[0], solution.slow, residuals)
+    variances, weights = 1.0 / precision, 1.0 / (precision * solution.measured[:count])
+    unused = np.flatnonzero(ignored_rows(rows, ignored))
+    if len(unused):
+        weights[unused] = 0.0
+        variances[unused] = IGNORED_FACTOR * variances[unused] + _predicted(problem, solution, unused)
+    return Residuals(rows, residuals**2 / variances, weights)
+
+
+def _predicted(problem: SlowProblem, solution: SlowSolution, which: NDArray[np.int64]) -> Vector:
+    """Variances of what a solution predicts for rows of fixes and velocities, those at ``which``."""
+    rows, covariance = problem.rows[which], solution.covariance
+    gradients = np.zeros((len(which), len(covariance) + 1))
+    velocity = np.where(rows["kind"] == POSITION, 0, 3)
+    for i, axis in enumerate("xyz"):
+        gradients[np.arange(len(which)), STATES_PER_AGENT * rows["agent"] + velocity + i] = rows[axis]
+    at, by = problem.window.slow_at[which], problem.window.slow_by[which]
+    states = solution.path.shape[1]
+    np.put_along_axis(gradients, np.where(at >= 0, states + at, len(covariance)), by, axis=1)
+    used = gradients[:, :-1]
+    return np.asarray(np.einsum("ri,ij,rj->r", used, covariance, used))
+
+
+@entry("void(SLOW_WINDOW, float64[::1], float64[::1], float64[::1])", SLOW_WINDOW=SLOW_WINDOW)
+def _residuals(window: SlowWindow, first: Vector, slow: Vector, out: Vector) -> None:
+    """out ``(m,)`` <- of the rows of the first tick, at its state ``(6n,)`` and the slow errors ``(q,)``."""
+    window = SlowWindow(*window)
+    unit = np.empty(4)
+    for r in range(out.shape[0]):
+        predicted = predict_row(window.code, window.data, r, first, window.eps, unit)
+        out[r] = window.data[r, VALUE] - predicted - slow_part(window, r, slow)

@@ -17,10 +17,10 @@ class Ages:
     """Since the last own fix; ``None``: there was none."""
     imu_coverage: float
     """Share of the latest tick, 0..1, that the IMU vouches for."""
-    aided: bool = True
-    """Whether the attitude in the latest tick was that of an autopilot with positions."""
     heard_age_s: Mapping[int, float] = field(default_factory=dict)
     """Since each neighbour that should be heard was, by id; ``inf``: never."""
+    aided: bool = True
+    """Whether the attitude in the latest tick was that of an autopilot with positions."""
 
 
 class StalenessMonitor:

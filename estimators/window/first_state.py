@@ -1,14 +1,18 @@
 """A window over its first state alone: the exact form of the moving horizon estimator with EKF pre-estimation.
 
 Variables are the state x_0 at the window's start and the slow errors s of its sensors, which are constants over a
-window. The process noise is integrated out: a Kalman filter that starts at x_0 with *zero* covariance runs through
-the window, and its innovations, weighted by their own covariance, are the likelihood of (x_0, s),
+window. The process noise is integrated out. That can be done by a Kalman filter that starts at x_0 with *zero*
+covariance: its innovations, weighted by their own covariance, are the likelihood of (x_0, s). The same can be done in
+information form, which is what stands here, since rows have few entries and the noise of a tick fewer dimensions than
+the state: with (L, l) information and vector of (x_k, s) given all rows before tick k,
 
-    e_r = y_r - h(x_k^-) - b_r's,      S_r = R_r + c_r P_k^- c_r',      J = |(x_0, s) - prior|^2 + sum_r e_r^2 / S_r.
+    rows of the tick        L += sum_r g_r g_r' / R_r,       l += sum_r g_r e_r / R_r
+    one tick on             P = F^-T L F^-1,   V = (1 + W'PW)^-T/2 W'P,   L <- P - V'V,   W = [B Q^1/2; 0]
 
-On a linear system its optimum is that over (x_0, s) and all process noises, and its newest state, with covariance
-Phi_N Cov(x_0, s) Phi_N' + P_N, is the Kalman filter's. Rows are linearised along the smoothed path, which a backward
-pass gives (A. E. Bryson and M. Frazier, 1963): that is Gauss-Newton on the joint problem without its variables.
+and L of the last tick is the information of the newest state and s. The noise that a backward pass over the V gives
+is the smoothed one. On a linear system the newest state and its covariance are the Kalman filter's. Rows are
+linearised along the smoothed path: that is Gauss-Newton on the joint problem, with its variables eliminated tick by
+tick. All is kept relative to the present path, so that no digits go to where the origin is.
 
 Outliers: beyond a threshold c the square of a residual z gives way to the logarithm of a Student-t density with nu
 degrees of freedom, so that a row's weight is (nu + c^2) / (nu + z^2); the rows of one fix have one weight.
@@ -21,17 +25,23 @@ from typing import NamedTuple
 import numpy as np
 
 from estimators.compiled.entries import entry, kernel, structure
-from estimators.compiled.linear_algebra import cholesky_solve, factor_upper, inverse_from_cholesky
+from estimators.compiled.linear_algebra import (
+    LIBRARY_SIZE,
+    cholesky_solve,
+    factor_upper,
+    inverse_from_cholesky,
+    solve_upper,
+)
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
-from estimators.model.motion import add_input_noise, predict_covariance, predict_sensitivity, transpose_predict
+from estimators.model.motion import add_input_noise
 from estimators.model.row_kernels import (
+    OFFSET,
     PRECISION,
+    SPEED,
     VALUE,
+    VELOCITY,
     IntArray,
-    add_gradient,
-    chain_gradient,
-    dot_gradient,
     predict_row,
 )
 from estimators.model.second_order import linearisation_variance
@@ -49,6 +59,8 @@ ROUNDING = 1e-10
 """Relative change of the objective that counts as none."""
 EXPECTED_CONTRACTION_M = 1.0
 """A first step of size s is expected to leave an error of s^2 over this: a range bends over metres."""
+NOTHING_M = 1e-5
+"""A last change of the path by less leaves gradients and weights what they were, to a millionth at ten metres."""
 DEGREES_OF_FREEDOM = 4.0
 """nu of the Student-t density beyond the threshold."""
 THRESHOLDS = np.array([0.0, 9.0, 11.8, 14.2])
@@ -80,8 +92,6 @@ class SlowWindow(NamedTuple):
     """``(3n,)``: by how much, m/s2."""
     prior_mean: Vector
     """``(D,)``."""
-    prior_information: Matrix
-    """``(D, D)``."""
     dt: float
     eps: float
     robust: bool
@@ -91,31 +101,23 @@ class SlowWindow(NamedTuple):
 SLOW_WINDOW = structure(
     SlowWindow,
     "int64[:, ::1], float64[:, ::1], int64[::1], int64[::1], int64[:, ::1], float64[:, ::1], float64[:, ::1],"
-    " float64[:, ::1], int64[::1], float64[::1], float64[::1], float64[:, ::1], float64, float64, boolean",
+    " float64[:, ::1], int64[::1], float64[::1], float64[::1], float64, float64, boolean",
 )
 
 
 class Sweep(NamedTuple):
-    """What one pass of the filter with zero start leaves."""
+    """What one pass through the window leaves; all is relative to the path that it was linearised at."""
 
-    gradients: Matrix
-    """``(m, D)`` of the innovations, each divided by its own sigma."""
-    innovations: Vector
-    """``(m,)`` divided by their sigmas."""
-    sigmas: Vector
-    """``(m,)`` of the innovations."""
-    gains: Matrix
-    """``(m, d)``."""
-    units: Matrix
-    """``(m, 4)`` gradients of the rows, see `predict_row`."""
-    before: Matrix
-    """``((N+1) d, d)``: covariance of every tick before its rows."""
-    mean: Vector
-    """``(d,)`` of the last tick."""
-    sensitivity: Matrix
-    """``(d, D)`` of the last state."""
-    covariance: Matrix
-    """``(d, d)`` of the last state given (x_0, s)."""
+    information: Matrix
+    """``(D, D)`` of the newest state and the slow errors; its upper Cholesky factor once it was solved."""
+    vector: Vector
+    """``(D,)``: what goes with it."""
+    noise: Matrix
+    """``(N 3n, D)``: V of every tick, how the noise of its accelerations hangs on what follows."""
+    offset: Matrix
+    """``(N, 3n)``: what it is where nothing follows."""
+    roots: Matrix
+    """``(N 3n, 3n)``: upper Cholesky factors of 1 + W'PW."""
 
 
 @kernel
@@ -131,129 +133,219 @@ def slow_part(window: SlowWindow, r: int, slow: Vector) -> float:
 
 
 @kernel
+def pushed(window: SlowWindow, k: int, c: int, slow: Vector) -> float:
+    """Acceleration c over tick k, less its slow error."""
+    push: float = window.accel[k, c]
+    if window.push_at[c] >= 0:
+        push -= window.push_by[c] * slow[window.push_at[c]]
+    return push
+
+
+@kernel
 def move(window: SlowWindow, k: int, slow: Vector, x: Vector) -> None:
     """x <- the state one tick after tick k, by the accelerations less their slow errors."""
     dt = window.dt
-    for a in range(x.shape[0] // STATES_PER_AGENT):
-        p = STATES_PER_AGENT * a
-        for i in range(3):
-            c = 3 * a + i
-            push = window.accel[k, c]
+    for c in range(x.shape[0] // 2):
+        p = STATES_PER_AGENT * (c // 3) + c % 3
+        push = pushed(window, k, c, slow)
+        x[p] += dt * x[p + 3] + 0.5 * dt * dt * push
+        x[p + 3] += dt * push
+
+
+@kernel
+def gradient(window: SlowWindow, r: int, unit: Vector, at: IntArray, by: Vector) -> int:
+    """Entries of row r's gradient over (x, s) that are not zero: where, how much; gives their number."""
+    code, data = window.code, window.data
+    count, a, b = 0, code[r, 1], code[r, 2]
+    turned = code[r, 0] == VELOCITY or code[r, 0] == SPEED
+    offset = data[r, OFFSET]
+    for i in range(3):
+        if unit[i] == 0.0:
+            continue
+        if turned:
+            at[count], by[count] = a + 3 + i, unit[i]
+            count += 1
+            continue
+        at[count], by[count] = a + i, unit[i]
+        count += 1
+        if b >= 0:
+            at[count], by[count] = b + i, -unit[i]
+            count += 1
+        if offset != 0.0:
+            at[count], by[count] = a + 3 + i, offset * unit[i]
+            count += 1
+            if b >= 0:
+                at[count], by[count] = b + 3 + i, -offset * unit[i]
+                count += 1
+    states = 2 * window.push_at.shape[0]
+    for j in range(window.slow_at.shape[1]):
+        if window.slow_at[r, j] < 0:
+            break
+        at[count], by[count] = states + window.slow_at[r, j], window.slow_by[r, j]
+        count += 1
+    return count
+
+
+@kernel
+def add_rows(window: SlowWindow, k: int, x: Vector, slow: Vector, variances: Vector, found: Sweep) -> None:
+    """Add what the rows of tick k say, linearised at state x."""
+    unit, at, by = np.empty(4), np.empty(24, np.int64), np.empty(24)
+    information, vector = found.information, found.vector
+    for r in range(window.start[k], window.start[k + 1]):
+        predicted = predict_row(window.code, window.data, r, x, window.eps, unit)
+        e = window.data[r, VALUE] - predicted - slow_part(window, r, slow)
+        count = gradient(window, r, unit, at, by)
+        for i in range(count):
+            weighted = by[i] / variances[r]
+            vector[at[i]] += weighted * e
+            row = information[at[i]]
+            for j in range(count):
+                row[at[j]] += weighted * by[j]
+
+
+@kernel
+def carry_back(window: SlowWindow, information: Matrix, vector: Vector) -> None:
+    """information, vector <- F^-T information F^-1, F^-T vector: the same said of the state one tick later."""
+    dt = window.dt
+    d, total = 2 * window.push_at.shape[0], vector.shape[0]
+    half = 0.5 * dt * dt
+    for c in range(d // 2):
+        p = STATES_PER_AGENT * (c // 3) + c % 3
+        v, s, by = p + 3, d + window.push_at[c], window.push_by[c]
+        place, speed = information[p], information[v]
+        for j in range(total):
+            speed[j] -= dt * place[j]
+        vector[v] -= dt * vector[p]
+        if window.push_at[c] >= 0:
+            slow = information[s]
+            for j in range(total):
+                slow[j] += by * (half * place[j] + dt * speed[j])
+            vector[s] += by * (half * vector[p] + dt * vector[v])
+    for i in range(total):
+        row = information[i]
+        for c in range(d // 2):
+            p = STATES_PER_AGENT * (c // 3) + c % 3
+            row[p + 3] -= dt * row[p]
             if window.push_at[c] >= 0:
-                push -= window.push_by[c] * slow[window.push_at[c]]
-            x[p + i] += dt * x[p + 3 + i] + 0.5 * dt * dt * push
-            x[p + 3 + i] += dt * push
+                row[d + window.push_at[c]] += window.push_by[c] * (half * row[p] + dt * row[p + 3])
 
 
 @kernel
-def sweep(window: SlowWindow, path: Matrix, slow: Vector, variances: Vector) -> Sweep:
-    """The filter from ``path[0]`` with zero covariance, rows linearised at ``path`` ``(N+1, d)``.
+def subtract_gram(v: Matrix, out: Matrix) -> None:
+    """out -= v'v."""
+    rows, n = v.shape
+    if rows * n * n >= LIBRARY_SIZE**3:
+        out -= np.dot(v.T, v)
+        return
+    for k in range(rows):
+        for i in range(n):
+            factor = v[k, i]
+            if factor != 0.0:
+                for j in range(n):
+                    out[i, j] -= factor * v[k, j]
 
-    ``variances`` ``(m,)`` are those of the rows, weights included.
+
+@kernel
+def solve_rows(root: Matrix, out: Matrix) -> None:
+    """out <- root'^-1 out, for an upper triangular ``root`` ``(k, k)`` and ``(k, n)``."""
+    n = out.shape[1]
+    for k in range(root.shape[0]):
+        scale = 1.0 / root[k, k]
+        for j in range(n):
+            out[k, j] *= scale
+        for i in range(k + 1, root.shape[0]):
+            factor = root[k, i]
+            if factor != 0.0:
+                for j in range(n):
+                    out[i, j] -= factor * out[k, j]
+
+
+@kernel
+def eliminate_noise(window: SlowWindow, path: Matrix, k: int, slow: Vector, found: Sweep) -> bool:
+    """Carry what is known over tick k, the noise of its accelerations integrated out; False where that fails."""
+    dt, width = window.dt, window.push_at.shape[0]
+    information, vector = found.information, found.vector
+    carry_back(window, information, vector)
+    first = k * width
+    noise, root, offset = found.noise[first : first + width], found.roots[first : first + width], found.offset[k]
+    for c in range(width):
+        p = STATES_PER_AGENT * (c // 3) + c % 3
+        scale = np.sqrt(window.accel_variance[k, c])
+        place, speed = scale * 0.5 * dt * dt, scale * dt
+        for j in range(vector.shape[0]):
+            noise[c, j] = place * information[p, j] + speed * information[p + 3, j]
+        now = (path[k + 1, p + 3] - path[k, p + 3]) / dt - pushed(window, k, c, slow)
+        offset[c] = place * vector[p] + speed * vector[p + 3] + now / scale
+    for c in range(width):
+        p = STATES_PER_AGENT * (c // 3) + c % 3
+        scale = np.sqrt(window.accel_variance[k, c])
+        for i in range(width):
+            root[i, c] = scale * (0.5 * dt * dt * noise[i, p] + dt * noise[i, p + 3])
+        root[c, c] += 1.0
+    if not factor_upper(root):
+        return False
+    solve_rows(root, noise)
+    for c in range(width):
+        offset[c] /= root[c, c]
+        for i in range(c + 1, width):
+            offset[i] -= root[c, i] * offset[c]
+        for j in range(vector.shape[0]):
+            vector[j] -= noise[c, j] * offset[c]
+    subtract_gram(noise, information)
+    return True
+
+
+@kernel
+def sweep(
+    window: SlowWindow, prior: Matrix, path: Matrix, slow: Vector, variances: Vector, found: Sweep
+) -> bool:
+    """From the window's prior information to that of its newest state, rows linearised at ``path`` ``(N+1, d)``.
+
+    ``variances`` ``(m,)`` are those of the rows, weights included. False where it is not positive definite.
     """
-    code, data, start, dt = window.code, window.data, window.start, window.dt
-    ticks, d, m = path.shape[0], path.shape[1], code.shape[0]
-    variables = window.prior_mean.shape[0]
-    out = Sweep(
-        np.empty((m, variables)), np.empty(m), np.empty(m), np.zeros((m, d)), np.empty((m, 4)),
-        np.zeros((ticks * d, d)), path[0].copy(), np.zeros((d, variables)), np.zeros((d, d)),
-    )  # fmt: skip
-    x, sens, cov = out.mean, out.sensitivity, out.covariance
-    column, away = np.zeros(d), np.empty(d)
-    for i in range(d):
-        sens[i, i] = 1.0
-    for k in range(ticks):
-        if k > 0:
-            move(window, k - 1, slow, x)
-            predict_sensitivity(sens, dt)
-            for c in range(d // 2):
-                if window.push_at[c] >= 0:
-                    p, j = STATES_PER_AGENT * (c // 3) + c % 3, d + window.push_at[c]
-                    sens[p, j] -= 0.5 * dt * dt * window.push_by[c]
-                    sens[p + 3, j] -= dt * window.push_by[c]
-            predict_covariance(cov, window.accel_variance[k - 1], dt)
-        out.before[k * d : (k + 1) * d] = cov
-        for r in range(start[k], start[k + 1]):
-            for i in range(d):
-                away[i] = x[i] - path[k, i]
-            predicted = predict_row(code, data, r, path[k], window.eps, out.units[r])
-            unit, g = out.units[r], out.gradients[r]
-            e = data[r, VALUE] - predicted - slow_part(window, r, slow) - dot_gradient(code, data, r, unit, away)
-            chain_gradient(code, data, r, unit, sens, g)
-            for j in range(window.slow_at.shape[1]):
-                if window.slow_at[r, j] < 0:
-                    break
-                g[d + window.slow_at[r, j]] += window.slow_by[r, j]
-            variance = variances[r]
-            if k > 0:
-                chain_gradient(code, data, r, unit, cov, column)
-                variance += dot_gradient(code, data, r, unit, column)
-                for i in range(d):
-                    gain = column[i] / variance
-                    out.gains[r, i] = gain
-                    if gain != 0.0:
-                        x[i] += gain * e
-                        for j in range(variables):
-                            sens[i, j] -= gain * g[j]
-                        for j in range(d):
-                            cov[i, j] -= gain * column[j]
-            sigma = np.sqrt(variance)
-            out.sigmas[r] = sigma
-            out.innovations[r] = e / sigma
-            for j in range(variables):
-                g[j] /= sigma
-    return out
-
-
-@kernel
-def normal_factor(window: SlowWindow, found: Sweep, factor: Matrix) -> bool:
-    """factor <- upper Cholesky of the Hessian over (x_0, s); False where it is not positive definite."""
-    factor[:, :] = window.prior_information + np.dot(found.gradients.T.copy(), found.gradients)
-    return factor_upper(factor)
-
-
-@kernel
-def step(window: SlowWindow, found: Sweep, factor: Matrix, path: Matrix, slow: Vector) -> Vector:
-    """Gauss-Newton's change of (x_0, s)."""
-    d = path.shape[1]
-    away = np.empty(window.prior_mean.shape[0])
+    d, total = path.shape[1], prior.shape[0]
+    away = np.empty(total)
     for i in range(d):
         away[i] = window.prior_mean[i] - path[0, i]
-    for j in range(slow.shape[0]):
-        away[d + j] = window.prior_mean[d + j] - slow[j]
-    change: Vector = np.dot(window.prior_information, away) + np.dot(found.innovations, found.gradients)
-    cholesky_solve(factor, change)
-    return change
+    for j in range(d, total):
+        away[j] = window.prior_mean[j] - slow[j - d]
+    found.information[:, :] = prior
+    found.vector[:] = np.dot(prior, away)
+    for k in range(path.shape[0]):
+        if k > 0 and not eliminate_noise(window, path, k - 1, slow, found):
+            return False
+        add_rows(window, k, path[k], slow, variances, found)
+    return factor_upper(found.information)
 
 
 @kernel
-def smoothed(window: SlowWindow, found: Sweep, change: Vector, path: Matrix, slow: Vector, out: Matrix) -> None:
-    """out ``(N+1, d)`` <- the states given all rows and (x_0, s) changed by ``change``; ``slow`` is after it."""
-    code, data, start = window.code, window.data, window.start
-    ticks, d = path.shape
-    innovations = found.innovations - np.dot(found.gradients, change)
-    x = path[0] + change[:d]
-    for k in range(ticks):
-        if k > 0:
-            move(window, k - 1, slow, x)
-        out[k] = x
-        for r in range(start[k], start[k + 1]):
-            e = innovations[r] * found.sigmas[r]
-            for i in range(d):
-                x[i] += found.gains[r, i] * e
-    adjoint = np.zeros(d)
-    for k in range(ticks - 1, 0, -1):
-        for r in range(start[k + 1] - 1, start[k] - 1, -1):
-            total = innovations[r] / found.sigmas[r]
-            for i in range(d):
-                total -= found.gains[r, i] * adjoint[i]
-            add_gradient(code, data, r, found.units[r], total, adjoint)
+def smoothed(window: SlowWindow, found: Sweep, path: Matrix, slow: Vector, out: Matrix, there: Vector) -> None:
+    """out ``(N+1, d)``, there ``(q,)`` <- path and slow errors changed to where a sweep's linear problem has them."""
+    d, dt, width = path.shape[1], window.dt, window.push_at.shape[0]
+    change = found.vector.copy()
+    cholesky_solve(found.information, change)
+    for j in range(there.shape[0]):
+        there[j] = slow[j] + change[d + j]
+    noise = np.empty(width)
+    for k in range(path.shape[0] - 1, -1, -1):
         for i in range(d):
-            total = 0.0
-            for j in range(d):
-                total += found.before[k * d + i, j] * adjoint[j]
-            out[k, i] += total
-        transpose_predict(adjoint, window.dt)
+            out[k, i] = path[k, i] + change[i]
+        if k == 0:
+            break
+        first = (k - 1) * width
+        for c in range(width):
+            total = -found.offset[k - 1, c]
+            for j in range(change.shape[0]):
+                total += found.noise[first + c, j] * change[j]
+            noise[c] = total
+        solve_upper(found.roots[first : first + width], noise)
+        for c in range(width):
+            p = STATES_PER_AGENT * (c // 3) + c % 3
+            push = np.sqrt(window.accel_variance[k - 1, c]) * noise[c]
+            if window.push_at[c] >= 0:
+                push -= window.push_by[c] * change[d + window.push_at[c]]
+            change[p + 3] -= dt * push
+            change[p] -= dt * change[p + 3] + 0.5 * dt * dt * push
 
 
 @kernel
@@ -283,7 +375,7 @@ def weigh(window: SlowWindow, path: Matrix, slow: Vector, variances: Vector) -> 
 
 
 @kernel
-def objective(window: SlowWindow, path: Matrix, slow: Vector, variances: Vector) -> float:
+def objective(window: SlowWindow, prior: Matrix, path: Matrix, slow: Vector, variances: Vector) -> float:
     """The joint objective, without a factor one half, at a path that the dynamics admit; sets the ``variances``."""
     d, dt = path.shape[1], window.dt
     away = np.empty(window.prior_mean.shape[0])
@@ -291,57 +383,62 @@ def objective(window: SlowWindow, path: Matrix, slow: Vector, variances: Vector)
         away[i] = path[0, i] - window.prior_mean[i]
     for j in range(slow.shape[0]):
         away[d + j] = slow[j] - window.prior_mean[d + j]
-    total = float(np.dot(away, np.dot(window.prior_information, away)))
+    total = float(np.dot(away, np.dot(prior, away)))
     for k in range(path.shape[0] - 1):
         for c in range(d // 2):
             v = STATES_PER_AGENT * (c // 3) + 3 + c % 3
-            push = window.accel[k, c]
-            if window.push_at[c] >= 0:
-                push -= window.push_by[c] * slow[window.push_at[c]]
-            noise = (path[k + 1, v] - path[k, v]) / dt - push
+            noise = (path[k + 1, v] - path[k, v]) / dt - pushed(window, k, c, slow)
             total += noise * noise / window.accel_variance[k, c]
     return total + weigh(window, path, slow, variances)
 
 
 @kernel
 def minimise(
-    window: SlowWindow, path: Matrix, slow: Vector, variances: Vector, max_iterations: int, tolerance: float
-) -> tuple[int, int, float]:
+    window: SlowWindow,
+    prior: Matrix,
+    path: Matrix,
+    slow: Vector,
+    variances: Vector,
+    max_iterations: int,
+    tolerance: float,
+    found: Sweep,
+) -> tuple[int, int, float, bool]:
     """Minimise from ``path`` ``(N+1, d)`` and ``slow`` ``(q,)``, in place; ``variances`` ``(m,)`` come out weighted.
 
     Converged when the change still expected from another iteration, estimated from the contraction, is below
-    ``tolerance`` in every state. Gives the outcome, the iterations and the objective.
+    ``tolerance`` in every state. Gives the outcome, the iterations, the objective, and whether ``found`` is, to
+    rounding, what a sweep at the end would find.
     """
-    d, variables = path.shape[1], window.prior_mean.shape[0]
-    factor = np.empty((variables, variables))
     trial, there = np.empty_like(path), np.empty_like(slow)
     trial_variances = np.empty_like(variances)
-    value = objective(window, path, slow, variances)
+    value = objective(window, prior, path, slow, variances)
     last = EXPECTED_CONTRACTION_M
     for iteration in range(max_iterations):
-        found = sweep(window, path, slow, variances)
-        if not normal_factor(window, found, factor):
-            return UNUSABLE, iteration, value
-        change = step(window, found, factor, path, slow)
-        there[:] = slow + change[d:]
-        smoothed(window, found, change, path, there, trial)
-        size = max(np.abs(trial - path).max(), 0.0)
+        if not sweep(window, prior, path, slow, variances, found):
+            return UNUSABLE, iteration, value, False
+        smoothed(window, found, path, slow, trial, there)
+        size = 0.0
+        for k in range(path.shape[0]):
+            for i in range(path.shape[1]):
+                size = max(size, abs(trial[k, i] - path[k, i])) if np.isfinite(trial[k, i]) else np.inf
         if not np.isfinite(size):
-            return UNUSABLE, iteration, value
-        _, new = _shared_step(window, path, slow, trial, there, trial_variances, value, size > SLOW * last)
+            return UNUSABLE, iteration, value, False
+        slowly = size > SLOW * last
+        _, new = _shared_step(window, prior, path, slow, trial, there, trial_variances, value, slowly)
         if not new <= value + ROUNDING * (1.0 + abs(value)):
-            return (CONVERGED if size < tolerance else NOT_CONVERGED), iteration + 1, value
+            return (CONVERGED if size < tolerance else NOT_CONVERGED), iteration + 1, value, True
         path[:], slow[:], variances[:] = trial, there, trial_variances
         value = new
         if size * min(size / last, 1.0) < tolerance:
-            return CONVERGED, iteration + 1, value
+            return CONVERGED, iteration + 1, value, size < NOTHING_M
         last = size
-    return NOT_CONVERGED, max_iterations, value
+    return NOT_CONVERGED, max_iterations, value, False
 
 
 @kernel
 def _shared_step(
     window: SlowWindow,
+    prior: Matrix,
     path: Matrix,
     slow: Vector,
     trial: Matrix,
@@ -357,38 +454,19 @@ def _shared_step(
     objective there; ``value`` is that at the start, and what is not below it means that no share was found.
     """
     full, full_slow = trial.copy(), there.copy()
-    new, share = objective(window, trial, there, variances), 1.0
+    new, share = objective(window, prior, trial, there, variances), 1.0
     if slowly:
         trial[:], there[:] = 0.5 * (path + full), 0.5 * (slow + full_slow)
-        middle = objective(window, trial, there, variances)
+        middle = objective(window, prior, trial, there, variances)
         bend = 2.0 * (new - 2.0 * middle + value)
         share = min(max((3.0 * value - 4.0 * middle + new) / (2.0 * bend), SHORTEST_STEP), 2.0) if bend > 0.0 else 1.0
         trial[:], there[:] = path + share * (full - path), slow + share * (full_slow - slow)
-        new = objective(window, trial, there, variances)
+        new = objective(window, prior, trial, there, variances)
     while not new <= value + ROUNDING * (1.0 + abs(value)) and share > SHORTEST_STEP:
         share *= 0.5
         trial[:], there[:] = path + share * (full - path), slow + share * (full_slow - slow)
-        new = objective(window, trial, there, variances)
+        new = objective(window, prior, trial, there, variances)
     return share, new
-
-
-@kernel
-def newest_covariance(found: Sweep, factor: Matrix, out: Matrix) -> None:
-    """out ``(D, D)`` <- covariance of the newest state and the slow errors, from a sweep and its normal factor."""
-    d, variables = found.sensitivity.shape
-    start = np.empty((variables, variables))
-    inverse_from_cholesky(factor, start)
-    carry = np.zeros((variables, variables))
-    carry[:d] = found.sensitivity
-    for j in range(d, variables):
-        carry[j, j] = 1.0
-    out[:, :] = np.dot(np.dot(carry, start), carry.T.copy())
-    out[:d, :d] += found.covariance
-    for i in range(variables):
-        for j in range(i):
-            middle = 0.5 * (out[i, j] + out[j, i])
-            out[i, j] = middle
-            out[j, i] = middle
 
 
 @kernel
@@ -397,29 +475,38 @@ def marginalise(window: SlowWindow, path: Matrix, variances: Vector, mean: Vecto
 
     ``covariance`` comes in as that of the prior. Rows are linearised at the smoothed ``path``.
     """
-    code, data = window.code, window.data
-    d, variables = path.shape[1], window.prior_mean.shape[0]
+    d, total, rows = path.shape[1], window.prior_mean.shape[0], window.start[1]
     mean[:] = window.prior_mean
-    unit, column, away = np.empty(4), np.empty(variables), np.empty(d)
-    for r in range(window.start[0], window.start[1]):
-        for i in range(d):
-            away[i] = mean[i] - path[0, i]
-        e = data[r, VALUE] - predict_row(code, data, r, path[0], window.eps, unit)
-        e -= slow_part(window, r, mean[d:]) + dot_gradient(code, data, r, unit, away)
-        chain_gradient(code, data, r, unit, covariance[:d], column)
-        for j in range(window.slow_at.shape[1]):
-            at, by = window.slow_at[r, j], window.slow_by[r, j]
-            if at < 0:
-                break
-            for i in range(variables):
-                column[i] += by * covariance[d + at, i]
-        variance = variances[r] + dot_gradient(code, data, r, unit, column[:d]) + slow_part(window, r, column[d:])
-        for i in range(variables):
-            gain = column[i] / variance
-            mean[i] += gain * e
-            if gain != 0.0:
-                for j in range(variables):
-                    covariance[i, j] -= gain * column[j]
+    if rows == 0:
+        return
+    unit, at, by = np.empty(4), np.empty((rows, 24), np.int64), np.empty((rows, 24))
+    counts, misses = np.empty(rows, np.int64), np.empty(rows)
+    columns, root = np.zeros((rows, total)), np.empty((rows, rows))
+    for r in range(rows):
+        predicted = predict_row(window.code, window.data, r, path[0], window.eps, unit)
+        count = gradient(window, r, unit, at[r], by[r])
+        counts[r] = count
+        misses[r] = window.data[r, VALUE] - predicted
+        for i in range(count):
+            here = at[r, i]
+            misses[r] -= by[r, i] * (mean[here] - path[0, here] if here < d else mean[here])
+            for j in range(total):
+                columns[r, j] += by[r, i] * covariance[here, j]
+    for r in range(rows):
+        for other in range(rows):
+            root[other, r] = 0.0
+            for i in range(counts[r]):
+                root[other, r] += by[r, i] * columns[other, at[r, i]]
+        root[r, r] += variances[r]
+    factor_upper(root)
+    solve_rows(root, columns)
+    for r in range(rows):
+        misses[r] /= root[r, r]
+        for i in range(r + 1, rows):
+            misses[i] -= root[r, i] * misses[r]
+        for j in range(total):
+            mean[j] += columns[r, j] * misses[r]
+    subtract_gram(columns, covariance)
 
 
 @kernel
@@ -484,19 +571,28 @@ def solve_first_state(
     starts one tick later. Gives the outcome, the iterations and the objective.
     """
     window = SlowWindow(*window)
-    variables = window.prior_mean.shape[0]
-    outcome, iterations, value = minimise(window, path, slow, variances, max_iterations, tolerance)
+    total, ticks, width = window.prior_mean.shape[0], window.accel.shape[0], window.push_at.shape[0]
+    factor, prior = covariance.copy(), np.empty((total, total))
+    if not factor_upper(factor):
+        return UNUSABLE, 0, 0.0
+    inverse_from_cholesky(factor, prior)
+    found = Sweep(
+        factor, np.empty(total), np.empty((ticks * width, total)), np.empty((ticks, width)),
+        np.empty((ticks * width, width)),
+    )  # fmt: skip
+    outcome, iterations, value, swept = minimise(
+        window, prior, path, slow, variances, max_iterations, tolerance, found
+    )
     if outcome == UNUSABLE:
         return outcome, iterations, value
-    factor = np.empty((variables, variables))
     measured[:] = variances
     for _ in range(REWEIGHTINGS + 1):
-        found = sweep(window, path, slow, variances)
-        if not normal_factor(window, found, factor):
+        if not swept and not sweep(window, prior, path, slow, variances, found):
             return UNUSABLE, iterations, value
-        newest_covariance(found, factor, newest)
+        inverse_from_cholesky(found.information, newest)
         if not add_missed(window, rows, path, newest, measured, variances):
             break
+        swept = False
     if slide:
         marginalise(window, path, variances, mean, covariance)
         predict_moments(window, keep, added, mean, covariance)

@@ -84,8 +84,6 @@ def slow_problem(
     """The problem of a window with a belief about its start; ``white`` ``(n, 3)``: see `SystematicSizes`.
 
     ``ignored`` ``(n,)``: whose fixes and velocities get no weight; absent = nobody's.
-
-    Raises ``numpy.linalg.LinAlgError`` where the belief's covariance is singular.
     """
     rows, start = window.rows()
     rows = np.ascontiguousarray(rows)
@@ -102,11 +100,10 @@ def slow_problem(
     else:
         at, by = np.full((len(rows), 1), -1, np.int64), np.zeros((len(rows), 1))
         push_at, push_by = np.full(3 * agents, -1, np.int64), np.zeros(3 * agents)
-    information = np.linalg.inv(belief.covariance)
     return SlowProblem(
         SlowWindow(
             code, data, start, group, at, by, accel, accel_variance, push_at, push_by, belief.mean,
-            0.5 * (information + information.T), period_s, eps, robust,
+            period_s, eps, robust,
         ),
         rows,
     )  # fmt: skip
@@ -154,7 +151,7 @@ def solve_slow(
         path, slow, measured, variances, newest, mean, covariance,
     )  # fmt: skip
     if outcome == UNUSABLE:
-        raise ArithmeticError("the window's information is not positive definite")
+        raise ArithmeticError("the window's prior or its information is not positive definite")
     arrival = SlowBelief(mean, 0.5 * (covariance + covariance.T), belief.sizes) if slide else belief
     return SlowSolution(
         path, slow, newest, measured, variances, arrival, outcome == CONVERGED, int(iterations), float(cost)

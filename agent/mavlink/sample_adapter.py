@@ -73,6 +73,7 @@ class SampleAdapter:
         """The receiver's last word on its fix."""
         self.aided = True
         """Whether the autopilot's own estimator is aided by positions, by its last word."""
+        self._was_aided = False
         self.frozen = False
         """Whether the receiver repeats a fix that its own velocity contradicts."""
         self.skipped: Counter[str] = Counter()
@@ -83,6 +84,7 @@ class SampleAdapter:
         self._last_fix, self._repeats, self.frozen = (), 0, False
         self.fix_type = 0
         self.aided = True
+        self._was_aided = False
 
     def convert(self, message: Message, arrival_s: float) -> Sample | None:
         """The sample of a message that arrived at fleet time ``arrival_s``; ``None`` if it gives none."""
@@ -142,7 +144,9 @@ class SampleAdapter:
 
     def _estimator_status(self, message: Message, _arrival_s: float) -> Sample | None:
         """ESTIMATOR_STATUS and EKF_STATUS_REPORT have the same flags for what is asked here."""
-        self.aided = bool(message.flags & _AIDED) and not message.flags & mavlink.ESTIMATOR_CONST_POS_MODE
+        aided = bool(message.flags & _AIDED) and not message.flags & mavlink.ESTIMATOR_CONST_POS_MODE
+        self._was_aided = self._was_aided or aided
+        self.aided = aided or not self._was_aided  # before its first position it stands still: gravity levels it
         return None
 
     # --- GPS -----------------------------------------------------------------------------------------------

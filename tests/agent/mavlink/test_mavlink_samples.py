@@ -275,7 +275,9 @@ def test_an_attitude_says_whether_the_autopilot_is_aided_by_positions(
 ) -> None:
     made = adapter(ardupilot)
     attitude = mavlink.MAVLink_attitude_quaternion_message(99_990, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    before = convert(made, attitude)
+    assert convert(made, estimator_status(WITHOUT_POSITION, ardupilot)) is None
+    before = convert(made, attitude)  # it has had no position yet: it stands still, and is level
+    assert convert(made, estimator_status(AIDED, ardupilot)) is None
     assert convert(made, estimator_status(flags, ardupilot)) is None
     after = convert(made, attitude)
 
@@ -285,7 +287,8 @@ def test_an_attitude_says_whether_the_autopilot_is_aided_by_positions(
 
 def test_after_a_reboot_its_last_word_on_that_is_forgotten() -> None:
     made = adapter()
-    convert(made, estimator_status(WITHOUT_POSITION, False))
+    for flags in (AIDED, WITHOUT_POSITION):
+        convert(made, estimator_status(flags, False))
     made.reset()
     attitude = mavlink.MAVLink_attitude_quaternion_message(99_990, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert convert(made, attitude).aided

@@ -184,7 +184,12 @@ class JointWindow:
             cost = self.cost(z)
             if np.abs(length * step).max() < 1e-12:
                 break
-        step = self.gauss_newton(z)[1]
+        for _ in range(iterations):  # the cost is down to its rounding: half steps contract where whole ones swing
+            step = self.gauss_newton(z)[1]
+            if np.abs(step).max() < 1e-11:
+                break
+            z = z + 0.5 * step
+        cost, step = self.cost(z), self.gauss_newton(z)[1]
         return JointOptimum(z, self.path(z), z[self.d : self.d + self.q], cost, float(np.abs(step).max()))
 
     def start_at_prior(self) -> Array:

@@ -31,6 +31,36 @@ DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
 """Defaults that go with a kind; of every other kind those of `EstimatorSettings`, which are the paper's."""
 
 
+class VehicleLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What no vehicle of the fleet goes beyond, in any state of the window: hard limits, for ``dmhe_shared``.
+
+    Altitudes are above the fleet's origin, not above the ground below. A limit keeps the estimate from places where
+    no vehicle can be; it does not keep a vehicle within. Leave room for what it may do.
+    """
+
+    floor_m: float | None = None
+    """Lowest altitude; absent = none."""
+
+    ceiling_m: float | None = None
+    """Highest altitude, above the floor; absent = none."""
+
+    north_m: tuple[float, float] | None = None
+    """Lowest and highest north; absent = none."""
+
+    east_m: tuple[float, float] | None = None
+    """Lowest and highest east; absent = none."""
+
+    speed_mps: Positive | None = None
+    """Highest speed, over all axes; absent = none."""
+
+
+class LimitsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Limits of the states, a table for each kind of body."""
+
+    vehicle: VehicleLimits = VehicleLimits()
+    """Of vehicles."""
+
+
 class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Settings of one estimator; every agent of a fleet runs the same.
 
@@ -82,6 +112,9 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     state_box_speed_mps: Positive | None = None
     """Hard bound on every velocity component of every state in the window; absent = none."""
+
+    limits: LimitsTable = LimitsTable()
+    """Where bodies can be, and how fast (``dmhe_shared``)."""
 
     reciprocal_ranges: Literal["independent", "shared"] = "independent"
     """Ranges a->b and b->a of one tick: two measurements, or one exchange seen from both ends, fused once."""

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterable, Iterator
 
 from agent.config.endpoints import SPELLINGS, LinkKind, parse_endpoint
 from agent.config.faults import Fault
 from agent.config.tables import AgentTable, FleetConfig
 from agent.errors import EndpointError
+from estimators.settings import EstimatorSettings
 from transport.link.addresses import MAX_PORT, endpoint_fault, is_host
 
 IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
@@ -40,6 +42,21 @@ def _estimator(config: FleetConfig) -> Iterator[Fault]:
     if kind == CENTRALISED:
         expected = "a kind for agents; this one sees everything at once: `fleetloc estimate` and `bench` have it"
         yield Fault("estimator.kind", expected, f'"{kind}"')
+    yield from _limits(config.estimator)
+
+
+def _limits(settings: EstimatorSettings) -> Iterator[Fault]:
+    """What is between two limits must not be empty."""
+    vehicle, key = settings.limits.vehicle, "estimator.limits.vehicle"
+    for name in ("floor_m", "ceiling_m"):
+        value = getattr(vehicle, name)
+        if value is not None and not math.isfinite(value):
+            yield Fault(f"{key}.{name}", "a finite altitude", f"{value:g}")
+    if vehicle.floor_m is not None and vehicle.ceiling_m is not None and not vehicle.floor_m < vehicle.ceiling_m:
+        yield Fault(f"{key}.ceiling_m", f"above floor_m = {vehicle.floor_m:g}", f"{vehicle.ceiling_m:g}")
+    for name, sides in (("north_m", vehicle.north_m), ("east_m", vehicle.east_m)):
+        if sides is not None and not (-math.inf < sides[0] < sides[1] < math.inf):
+            yield Fault(f"{key}.{name}", "[lowest, highest], finite, the first below the second", f"{list(sides)}")
 
 
 def _agents(config: FleetConfig) -> Iterator[Fault]:

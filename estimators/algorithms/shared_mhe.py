@@ -26,15 +26,18 @@ from estimators.integrity.finding import Finding, What
 from estimators.integrity.innovations import InnovationMonitor
 from estimators.model.gaussian import Pair, Prior, symmetrised
 from estimators.model.layout import Layout
+from estimators.model.limits import state_limits
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
+from estimators.solvers.qp import make_engine
 from estimators.systematic.belief import SlowBelief
 from estimators.systematic.sizes import SystematicSizes
 from estimators.systematic.slow_errors import corrected_rows
 from estimators.window.arrival_cost import first_estimate
 from estimators.window.assembly import open_window
+from estimators.window.limited import solve_limited
 from estimators.window.problem import WindowProblem
 from estimators.window.slow_window import (
     SlowProblem,
@@ -42,7 +45,6 @@ from estimators.window.slow_window import (
     continued,
     leaving_residuals,
     slow_problem,
-    solve_slow,
 )
 
 
@@ -79,8 +81,9 @@ class SharedMovingHorizonEstimator:
         """Of the tick before, to start from."""
         self._consensus = Inheritance(slot)
         self._innovations = InnovationMonitor(layout.size, slot, period_s)
+        self._limits = state_limits(settings, layout.size)
         self._monitors = SharedMonitors(
-            layout, slot, body_of(mean, covariance, slot), period_s, settings.norm_smoothing_m
+            layout, slot, body_of(mean, covariance, slot), period_s, settings.norm_smoothing_m, self._limits
         )
 
     @property
@@ -137,6 +140,7 @@ class SharedMovingHorizonEstimator:
         for finding in contradictions:
             if finding.what is What.FIXES_CONTRADICT:
                 observable[finding.about] = False
+        observable[list(solution.strained)] = False
         self.belief, self._last = solution.arrival, solution
         if verdict.moves:
             moved = verdict.belief.arrival
@@ -147,7 +151,7 @@ class SharedMovingHorizonEstimator:
             verdict.belief.covariance,
             self._status(solution.converged, len(problem.rows) > 0, bool(observable[self.slot])),
             self.window.ages(),
-            SolverReport(iterations=solution.iterations, cost=solution.cost, moves=verdict.moves),
+            SolverReport(solution.iterations, solution.programs, solution.cost, solution.active, verdict.moves),
             observable,
             contradictions,
             self._innovations.averages(),
@@ -174,8 +178,9 @@ class SharedMovingHorizonEstimator:
             path, slow = self._last.path[slid:], self._last.slow
         guess = continued(path, problem, slow), slow
         limit = settings.max_iterations if budget is None else min(budget, settings.max_iterations)
-        return problem, solve_slow(
-            problem, self.belief, guess, limit, settings.tolerance, slide=self.window.full
+        bounds = None if self._limits is None else (self._limits, make_engine(settings.qp))
+        return problem, solve_limited(
+            problem, self.belief, guess, limit, settings.tolerance, bounds, slide=self.window.full
         )
 
     def _learn(self, problem: SlowProblem, solution: SlowSolution) -> None:
@@ -234,7 +239,9 @@ class SharedMovingHorizonEstimator:
         self._consensus.change_members(change)
         self._innovations.change_members(change)
         prior = change.fresh.get(self.slot)
-        self._monitors.change_members(change, None if prior is None else self._at_last_tick(prior))
+        self._limits = state_limits(self.settings, self.layout.size)
+        restart = None if prior is None else self._at_last_tick(prior)
+        self._monitors.change_members(change, restart, self._limits)
 
     def _at_last_tick(self, prior: Prior) -> Body:
         """A prior of the own state, of `prior_tick`, brought to the window's last tick."""

@@ -28,6 +28,7 @@ from estimators.integrity.fleet_mirror import FleetMirrorMonitor, MirrorImage, m
 from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.gaussian import covering
 from estimators.model.layout import STATES_PER_AGENT, Layout, block
+from estimators.model.limits import StateLimits
 from estimators.model.measurements import Matrix, RowTable, empty_rows
 from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
@@ -64,13 +65,21 @@ class Verdict:
 class SharedMonitors:
     """The monitors of one agent; ``own`` is its state at the first tick."""
 
-    def __init__(self, layout: Layout, slot: int, own: Body, period_s: float, norm_smoothing: float) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        slot: int,
+        own: Body,
+        period_s: float,
+        norm_smoothing: float,
+        limits: StateLimits | None = None,
+    ) -> None:
         self._slot = slot
         self._period_s = period_s
         self._norm_smoothing = norm_smoothing
         self._observability = ObservabilityMonitor(layout.size)
         self._mirror = FleetMirrorMonitor()
-        self._ambiguity = AmbiguityMonitor(slot, own, period_s)
+        self._ambiguity = AmbiguityMonitor(slot, own, period_s, limits)
 
     def look(self, problem: WindowProblem, measured: RowTable, belief: Belief, *, slide: bool) -> Verdict:
         """Weigh a solved window; ``measured`` are its rows with the sensors' own variances.
@@ -144,13 +153,15 @@ class SharedMonitors:
         mean[own] = place
         return InformationState.from_moments(mean, covering(arrival.covariance(), spread, self._slot))
 
-    def change_members(self, change: MemberChange, restart: Body | None) -> None:
-        """Go on with another fleet; ``restart``: the own state at the last tick, where it begins anew."""
+    def change_members(
+        self, change: MemberChange, restart: Body | None, limits: StateLimits | None = None
+    ) -> None:
+        """Go on with another fleet, its limits; ``restart``: the own state at the last tick, where it begins anew."""
         self._slot = change.own
         self._observability.change_members(change)
-        self._ambiguity.change_members(change)
+        self._ambiguity.change_members(change, limits)
         if restart is not None:
-            self._ambiguity = AmbiguityMonitor(change.own, restart, self._period_s)
+            self._ambiguity = AmbiguityMonitor(change.own, restart, self._period_s, limits)
 
 
 def _reversed(belief: Belief) -> Belief:

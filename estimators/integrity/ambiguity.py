@@ -42,6 +42,7 @@ from estimators.integrity.thresholds import (
     WEAK_M,
 )
 from estimators.model.layout import block
+from estimators.model.limits import StateLimits
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
 
@@ -103,9 +104,10 @@ class _Ranged(NamedTuple):
 class AmbiguityMonitor:
     """Follows one agent's own state; ``prior`` is its state before the first tick that is looked at."""
 
-    def __init__(self, slot: int, prior: Body, period_s: float) -> None:
+    def __init__(self, slot: int, prior: Body, period_s: float, limits: StateLimits | None = None) -> None:
         self._slot = slot
         self._period_s = period_s
+        self._limits = limits
         self._mixture: Mixture | None = Mixture.single(*prior)
         """None while the drone has fixes."""
         self._estimate = prior
@@ -133,13 +135,23 @@ class AmbiguityMonitor:
         self._foretold = Mixture.single(*before)
         self._advance(self._mixture, evidence)
         mixture = self._mixture = self._corrected(self._mixture, evidence)
-        if not is_sound(mixture):
+        if not is_sound(mixture) or not self._is_possible(mixture):
             mixture = self._mixture = Mixture.single(*evidence.estimate)
         return self._judged(mixture, evidence.estimate)
 
-    def change_members(self, change: MemberChange) -> None:
-        """Go on with another fleet; who left or begins anew is no longer a body that ranges went to."""
-        self._slot = change.own
+    def _is_possible(self, mixture: Mixture) -> bool:
+        """Give up hypotheses that are beyond the limits; False where none is left."""
+        if self._limits is None:
+            return True
+        allowed = self._limits.allow(self._slot, mixture.means, mixture.covariances)
+        if allowed.any() and not allowed.all():
+            mixture.log_weights, mixture.means = mixture.log_weights[allowed], mixture.means[allowed]
+            mixture.covariances = mixture.covariances[allowed]
+        return bool(allowed.any())
+
+    def change_members(self, change: MemberChange, limits: StateLimits | None = None) -> None:
+        """Go on with another fleet, its limits; who left or begins anew is no longer a body that ranges went to."""
+        self._slot, self._limits = change.own, limits
         stayed = {before: slot for slot, before in change.stayed.items()}
         kept = {key: seen for key, seen in self._places.items() if not isinstance(key, int) or key in stayed}
         self._places = {stayed[key] if isinstance(key, int) else key: seen for key, seen in kept.items()}

@@ -163,8 +163,8 @@ class DaqpEngine:
             np.eye(s + d),
             np.concatenate([problem.penalty[soft] * scale, problem.linear]),
             constraint,
-            np.concatenate([np.full(s, _NONE), problem.upper, np.full(s, _NONE)]),
-            np.concatenate([np.zeros(s), one_sided, problem.lower[soft]]),
+            np.concatenate([np.full(s, _NONE), np.minimum(problem.upper, _NONE), np.full(s, _NONE)]),
+            np.concatenate([np.zeros(s), np.maximum(one_sided, -_NONE), problem.lower[soft]]),
             np.zeros(2 * s + m, dtype=np.int32),
         )
         if flag < 1 or not np.isfinite(x).all():

@@ -69,6 +69,12 @@ class SlowSolution:
     converged: bool
     iterations: int
     cost: float
+    programs: int = 0
+    """Quadratic programs solved for limits."""
+    active: int = 0
+    """Limits that hold the optimum."""
+    strained: tuple[int, ...] = ()
+    """Slots that limits keep farther from where everything else has them than the covariance has it."""
 
 
 def slow_problem(

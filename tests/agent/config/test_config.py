@@ -103,6 +103,11 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         ("metrics.host=0.0.0", "metrics.host", "an address to listen on", "0.0.0"),
         ("adsb.address=foo", "adsb.address", "udpout:HOST:PORT", "names no transport"),
         ("estimator.kind=centralized_ekf", "estimator.kind", "a kind for agents", "centralized_ekf"),
+        ("estimator.limits.vehicle.floor=1", "estimator.limits.vehicle.floor", "one of floor_m", "an unknown key"),
+        ("estimator.limits.vehicle.floor_m=inf", "estimator.limits.vehicle.floor_m", "a finite number", "inf"),
+        ("estimator.limits.vehicle.east_m=[4,4]", "estimator.limits.vehicle.east_m", "[lowest, highest]", "[4"),
+        ("estimator.limits.vehicle.north_m=[4]", "estimator.limits.vehicle.north_m", "an array of length 2", "[4]"),
+        ("estimator.limits.vehicle.speed_mps=0", "estimator.limits.vehicle.speed_mps", "a number > 0", "0"),
         ("nonsense", "nonsense", "key=value with a dotted key", "'nonsense'"),
         ("fleet..name=1", "fleet..name", "key=value with a dotted key", "'fleet..name=1'"),
         ("fleet.name.x=1", "fleet.name", "a table", "'line3'"),
@@ -118,6 +123,15 @@ def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
     assert found in caught.value.found
     assert "\n" not in str(caught.value)
     assert str(caught.value).startswith(("--set: ", str(LINE3)))
+
+
+def test_a_ceiling_is_above_the_floor() -> None:
+    limits = "estimator.limits.vehicle"
+    config = load_config(LINE3, [f"{limits}.floor_m=-2", f"{limits}.ceiling_m=30"])
+    assert config.estimator.limits.vehicle.ceiling_m == 30.0
+    with pytest.raises(ConfigError) as caught:
+        load_config(LINE3, [f"{limits}.floor_m=-2", f"{limits}.ceiling_m=-3"])
+    assert (caught.value.key, caught.value.expected) == (f"{limits}.ceiling_m", "above floor_m = -2")
 
 
 def test_tables_of_other_rooms_are_carried_along_and_nothing_in_them_is_refused() -> None:

@@ -28,7 +28,7 @@ from estimators.model.gaussian import Pair, Prior, symmetrised
 from estimators.model.layout import Layout
 from estimators.model.limits import state_limits
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
-from estimators.model.members import MemberChange
+from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
 from estimators.solvers.qp import make_engine
@@ -75,8 +75,9 @@ class SharedMovingHorizonEstimator:
         mean, covariance = np.array(prior_mean, float), symmetrised(np.asarray(prior_covariance, float))
         self.belief = SlowBelief.first(mean, covariance, self._present_sizes())
         """About the window's start, before consensus."""
-        self._own: Pair = self.belief.kinematic().pair()
-        """Its states alone."""
+        self._states: InformationState | None = self.belief.kinematic()
+        """Its states alone, where they are those of the last tick's solution."""
+        self._own: Pair = self._states.pair()
         self._last: SlowSolution | None = None
         """Of the tick before, to start from."""
         self._consensus = Inheritance(slot)
@@ -105,7 +106,9 @@ class SharedMovingHorizonEstimator:
         """Open a tick: slide the window and insert what arrived."""
         self.window.open(tick)
         self.window.insert(measurements, inputs)
-        self._own = self.belief.kinematic().pair()
+        if self._states is None:
+            self._states = self.belief.kinematic()
+        self._own = self._states.pair()
         self._consensus.begin(self.window.first, self._own)
 
     def outgoing(self, round_: int) -> Payload:
@@ -125,6 +128,7 @@ class SharedMovingHorizonEstimator:
         """Solve the window, filter it for the next arrival cost, and let the monitors look at both."""
         if not self.window.begun:
             return first_estimate(self.window, self.belief.kinematic())
+        self._states = None
         pair = self._consensus.pair()
         if pair is not self._own:
             self.belief = self.belief.with_pair(self._own, pair)
@@ -141,10 +145,11 @@ class SharedMovingHorizonEstimator:
             if finding.what is What.FIXES_CONTRADICT:
                 observable[finding.about] = False
         observable[list(solution.strained)] = False
-        self.belief, self._last = solution.arrival, solution
+        self.belief, self._states, self._last = solution.arrival, belief.arrival, solution
         if verdict.moves:
             moved = verdict.belief.arrival
-            self.belief, self._last = solution.arrival.with_states(moved.mean, moved.covariance()), None
+            self.belief, self._states = solution.arrival.with_states(moved.mean, moved.covariance()), moved
+            self._last = None
         return Estimate(
             self.window.last,
             verdict.belief.path[-1],
@@ -233,7 +238,7 @@ class SharedMovingHorizonEstimator:
         if self._sizes is not None:
             self._sizes.change_members(change)
         self.belief = self.belief.reindexed(change, self._present_sizes())
-        self._last = None
+        self._states = self._last = None
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)
         self._consensus.change_members(change)

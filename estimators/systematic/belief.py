@@ -7,6 +7,7 @@ from typing import Self
 
 import numpy as np
 
+from estimators.compiled.entries import entry
 from estimators.model.gaussian import Pair, symmetrised
 from estimators.model.layout import block, states_of
 from estimators.model.measurements import Matrix, Vector
@@ -48,14 +49,22 @@ class SlowBelief:
     def with_pair(self, own: Pair, pair: Pair) -> SlowBelief:
         """The belief whose states are those of ``pair`` instead of those of ``own``, its present ones.
 
-        What the states say of the slow errors stays what it was: p(x, s) = p_pair(x) p_own(s | x).
+        What the states say of the slow errors stays what it was: p(x, s) = p_pair(x) p_own(s | x). Raises
+        ``numpy.linalg.LinAlgError`` where the pair's information is singular.
         """
-        d, information = self.states, np.linalg.inv(self.covariance)
-        vector = information @ self.mean
-        information[:d, :d] += pair[0] - own[0]
-        vector[:d] += pair[1] - own[1]
-        covariance = symmetrised(np.linalg.inv(information))
-        return replace(self, mean=covariance @ vector, covariance=covariance)
+        d = self.states
+        states = symmetrised(np.linalg.inv(pair[0]))
+        mean = states @ pair[1]
+        slope = self.covariance[d:, :d] @ own[0]
+        covariance = np.empty_like(self.covariance)
+        covariance[:d, :d] = states
+        covariance[d:, :d] = slope @ states
+        covariance[:d, d:] = covariance[d:, :d].T
+        covariance[d:, d:] = symmetrised(
+            self.covariance[d:, d:] + slope @ (states - self.covariance[:d, :d]) @ slope.T
+        )
+        slow = self.mean[d:] + slope @ (mean - self.mean[:d])
+        return replace(self, mean=np.concatenate((mean, slow)), covariance=covariance)
 
     def with_states(self, mean: Vector, covariance: Matrix) -> SlowBelief:
         """The belief with other states, which say nothing of the slow errors."""
@@ -71,16 +80,7 @@ class SlowBelief:
         nothing was measured, the slow error has the new prior.
         """
         mean, covariance, known = self.mean.copy(), self.covariance.copy(), self.sizes.copy()
-        for j in np.flatnonzero((sizes > WORTHWHILE * known) | (sizes < known / WORTHWHILE)):
-            at, before, after = self.states + j, known[j] ** 2, sizes[j] ** 2
-            if after > before:
-                covariance[at, at] += after - before
-            else:
-                column = covariance[:, at].copy()
-                total = column[at] + 1.0 / (1.0 / after - 1.0 / before)
-                mean -= column * (mean[at] / total)
-                covariance -= np.outer(column, column) / total
-            known[j] = sizes[j]
+        _resize(self.states, sizes, mean, covariance, known)
         return SlowBelief(mean, covariance, known)
 
     def reindexed(self, change: MemberChange, sizes: Vector) -> SlowBelief:
@@ -99,3 +99,25 @@ class SlowBelief:
         for slot, (mean, covariance) in change.fresh.items():
             made.mean[block(slot)], made.covariance[block(slot), block(slot)] = mean, covariance
         return made
+
+
+@entry("void(int64, float64[::1], float64[::1], float64[:, ::1], float64[::1])")
+def _resize(states: int, sizes: Vector, mean: Vector, covariance: Matrix, known: Vector) -> None:
+    """mean, covariance, known <- those with ``sizes``, where these have changed by a factor that is worthwhile."""
+    total = mean.shape[0]
+    column = np.empty(total)
+    for j in range(sizes.shape[0]):
+        if known[j] / WORTHWHILE <= sizes[j] <= WORTHWHILE * known[j]:
+            continue
+        at, before, after = states + j, known[j] * known[j], sizes[j] * sizes[j]
+        known[j] = sizes[j]
+        if after > before:
+            covariance[at, at] += after - before
+            continue
+        for i in range(total):
+            column[i] = covariance[at, i]
+        factor, was = 1.0 / (column[at] + 1.0 / (1.0 / after - 1.0 / before)), mean[at]
+        for i in range(total):
+            mean[i] -= column[i] * factor * was
+            for k in range(total):
+                covariance[i, k] -= column[i] * factor * column[k]

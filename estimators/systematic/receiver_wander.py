@@ -16,7 +16,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
@@ -64,37 +63,28 @@ class ReceiverWanders:
         self._outliers = np.full(agents, -1, np.int64)
         self._fixes = np.zeros(agents, np.int64)
         self._claims_m = np.zeros((agents, 2))
+        self._known: tuple[Matrix, Matrix] | None = None
 
     def weigh(self, rows: RowTable, accel: Vector, accel_variance: Vector) -> None:
         """Take in the rows of one tick, and the accelerations ``(3n,)`` from it to the next."""
+        self._known = None
         arrays = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
         _weigh(np.ascontiguousarray(rows), accel, accel_variance, self._period_s, *arrays)
 
     def sizes_m(self) -> Matrix:
         """Root mean square ``(n, 3)`` of the wander over the hypotheses, per axis."""
-        weights = self._weights()
-        size = np.sqrt(weights @ HYPOTHESES_M**2)
-        kept = np.sqrt(weights @ FACTORS**2)
-        unused_m = self._claims_m * np.sqrt(np.maximum(1.0 - kept**2, 0.0))
-        size = np.maximum(np.maximum(size, unused_m), np.median(size, axis=0))
-        size[:, 1] = np.clip(size[:, 1], VERTICAL[0] * size[:, 0], VERTICAL[1] * size[:, 0])
-        return np.asarray(size[:, [0, 0, 1]])
+        return self._told()[0].copy()
 
     def white_factors(self) -> Matrix:
         """Root mean square ``(n, 3)``, per axis, of the white noise of the fixes over what their receiver claims."""
-        return np.asarray(np.sqrt(self._weights() @ FACTORS**2)[:, [0, 0, 1]])
+        return self._told()[1].copy()
 
-    def _weights(self) -> Matrix:
-        """Of the hypotheses ``(n, 2, models)``, horizontal and vertical."""
-        trusted = (HYPOTHESES_M[0] == HYPOTHESES_M) & (FACTORS >= 1.0)
-        nats = self._nats + PRIOR_NATS + np.where(trusted, TRUST_NATS, 0.0) * self._watched()
-        nats -= nats.max(-1, keepdims=True)
-        weights = np.exp(nats)
-        return np.asarray(weights / weights.sum(-1, keepdims=True))
-
-    def _watched(self) -> NDArray[np.float64]:
-        """How far ``(n, 1, 1)`` each receiver has been watched, 0..1."""
-        return np.asarray(np.minimum(self._fixes / WATCHED_FIXES, 1.0)[:, None, None])
+    def _told(self) -> tuple[Matrix, Matrix]:
+        """Sizes and factors, computed once a tick."""
+        if self._known is None:
+            self._known = np.empty((len(self._nats), 3)), np.empty((len(self._nats), 3))
+            _tell(self._nats, self._fixes, self._claims_m, *self._known)
+        return self._known
 
     def change_members(self, stayed: Mapping[int, int], agents: int) -> None:
         """Go on with another fleet; ``stayed``: by new slot, the old one."""
@@ -104,6 +94,35 @@ class ReceiverWanders:
         for slot, old in stayed.items():
             for new_array, old_array in zip(after, before, strict=True):
                 new_array[slot] = old_array[old]
+
+
+@entry("void(float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])")
+def _tell(nats: Matrix, fixes: IntArray, claims: Matrix, sizes: Matrix, factors: Matrix) -> None:
+    """sizes, factors ``(n, 3)`` <- what the hypotheses make of the wander and of the white noise."""
+    agents, models = nats.shape[0], nats.shape[2]
+    weights, size, unused = np.empty(models), np.empty((agents, 2)), np.empty((agents, 2))
+    for a in range(agents):
+        watched = min(fixes[a] / WATCHED_FIXES, 1.0)
+        for group in range(2):
+            for h in range(models):
+                trusted = HYPOTHESES_M[h] == HYPOTHESES_M[0] and FACTORS[h] >= 1.0
+                weights[h] = nats[a, group, h] + PRIOR_NATS[h] + (TRUST_NATS * watched if trusted else 0.0)
+            highest, total, wander, white = weights.max(), 0.0, 0.0, 0.0
+            for h in range(models):
+                weight = np.exp(weights[h] - highest)
+                total += weight
+                wander += weight * HYPOTHESES_M[h] ** 2
+                white += weight * FACTORS[h] ** 2
+            size[a, group] = np.sqrt(wander / total)
+            unused[a, group] = claims[a, group] * np.sqrt(max(1.0 - white / total, 0.0))
+            for axis in range(2 * group, 2 + group):
+                factors[a, axis] = np.sqrt(white / total)
+    usual = np.median(size[:, 0].copy()), np.median(size[:, 1].copy())
+    for a in range(agents):
+        across = max(size[a, 0], unused[a, 0], usual[0])
+        down = max(size[a, 1], unused[a, 1], usual[1])
+        sizes[a, 0], sizes[a, 1] = across, across
+        sizes[a, 2] = min(max(down, VERTICAL[0] * across), VERTICAL[1] * across)
 
 
 @entry(

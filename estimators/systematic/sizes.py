@@ -45,12 +45,15 @@ class SystematicSizes:
         self._lost_ticks = np.zeros(agents, np.int64)
         """Since the last fix that left the window."""
         self._most_ticks = round(LOST_S / period_s)
+        self._made: Vector | None = None
+        """What `sizes` gives until something is learned."""
 
     def learn(self, rows: RowTable, accel: Vector, accel_variance: Vector, errors: Vector, variance: Vector) -> None:
         """Take in a tick that leaves the window: its rows, its accelerations ``(3n,)`` and their variances.
 
         ``errors``, ``variance`` ``(q,)``: the slow errors as they are estimated now.
         """
+        self._made = None
         self._wanders.weigh(rows, accel, accel_variance)
         self._lost_ticks += 1
         self._lost_ticks[rows["agent"][rows["kind"] == POSITION]] = 0
@@ -66,6 +69,11 @@ class SystematicSizes:
 
     def sizes(self) -> Vector:
         """Standard deviations ``(q,)`` of the slow errors."""
+        if self._made is None:
+            self._made = self._make()
+        return self._made.copy()
+
+    def _make(self) -> Vector:
         wander = self._wanders.sizes_m() ** 2
         agents = len(wander)
         shared = COMMON_SHARE * np.median(wander, axis=0) if agents > 1 else np.zeros(3)
@@ -84,7 +92,7 @@ class SystematicSizes:
 
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet."""
-        known = change.stayed
+        self._made, known = None, change.stayed
         self._wanders.change_members(known, change.after.size)
         self._accel_mps2 = np.array(
             [self._accel_mps2[known[slot]] if slot in known else ACCEL_MPS2[0] for slot in range(change.after.size)]

@@ -146,21 +146,61 @@ def solve_slow(
 
     Raises ``ArithmeticError`` where it cannot be solved.
     """
-    window, total = problem.window, len(belief.mean)
-    period_s = window.dt
-    keep = slow_errors.kept_per_tick(belief.states // 6, period_s) if len(belief.sizes) else np.zeros(0)
-    path, slow = guess[0].copy(), guess[1].copy()
+    window = problem.window
+    keep = slow_errors.kept_per_tick(belief.states // 6, window.dt) if len(belief.sizes) else np.zeros(0)
+    added = (1.0 - keep**2) * belief.sizes**2
+    told = _told(window, belief)
+    at, grid = np.flatnonzero(told), np.ix_(told, told)
+    window, errors = _reduced(window, told), told[belief.states :]
+    path, slow = guess[0].copy(), guess[1][errors]
     measured, variances = np.empty(len(problem.rows)), np.empty(len(problem.rows))
-    newest, mean, covariance = np.empty((total, total)), np.empty(total), belief.covariance.copy()
+    newest, mean, covariance = np.empty((len(at), len(at))), np.empty(len(at)), belief.covariance[grid]
     outcome, iterations, cost = solve_first_state(
-        plain(window), problem.rows, keep, (1.0 - keep**2) * belief.sizes**2, slide, max_iterations, tolerance,
+        plain(window), problem.rows, keep[errors], added[errors], slide, max_iterations, tolerance,
         path, slow, measured, variances, newest, mean, covariance,
     )  # fmt: skip
     if outcome == UNUSABLE:
         raise ArithmeticError("the window's prior or its information is not positive definite")
-    arrival = SlowBelief(mean, 0.5 * (covariance + covariance.T), belief.sizes) if slide else belief
+    # the other errors are what they were believed to be, and go on as they would alone
+    whole = np.diag(belief.covariance.diagonal())
+    whole[grid] = newest
+    estimated = belief.mean[belief.states :].copy()
+    estimated[errors] = slow
+    arrival = belief
+    if slide:
+        ahead = np.concatenate((np.ones(belief.states), keep))
+        following = np.diag(ahead**2 * belief.covariance.diagonal())
+        following[range(belief.states, len(told)), range(belief.states, len(told))] += added
+        following[grid] = 0.5 * (covariance + covariance.T)
+        expected = ahead * belief.mean
+        expected[at] = mean
+        arrival = SlowBelief(expected, following, belief.sizes)
     return SlowSolution(
-        path, slow, newest, measured, variances, arrival, outcome == CONVERGED, int(iterations), float(cost)
+        path, estimated, whole, measured, variances, arrival, outcome == CONVERGED, int(iterations), float(cost)
+    )
+
+
+def _told(window: SlowWindow, belief: SlowBelief) -> NDArray[np.bool_]:
+    """Which of the variables ``(D,)`` the window can tell anything about.
+
+    All states, and slow errors that its rows or accelerations hold or that hang together with other variables. Two
+    drones that never ranged each other have a bias of which nothing is ever known.
+    """
+    d = belief.states
+    told = np.ones(len(belief.mean), np.bool_)
+    told[d:] = np.count_nonzero(belief.covariance[d:], axis=1) > 1
+    told[d + window.slow_at[window.slow_at >= 0]] = True
+    told[d + window.push_at[window.push_at >= 0]] = True
+    return told
+
+
+def _reduced(window: SlowWindow, told: NDArray[np.bool_]) -> SlowWindow:
+    """A window without the variables that it can tell nothing about."""
+    if told.all():
+        return window
+    place = np.append(np.cumsum(told[2 * len(window.push_at) :]) - 1, -1)
+    return window._replace(
+        slow_at=place[window.slow_at], push_at=place[window.push_at], prior_mean=window.prior_mean[told]
     )
 
 

@@ -56,13 +56,20 @@ def draw_window(
     kinds: Sequence[Kind] = builders.ALL_KINDS,
     rows_per_agent: int = 2,
     prior_m: float = 0.2,
+    correlated: bool = True,
 ) -> DrawnWindow:
-    """Rows of random kinds at instants of their own; all of the belief is correlated, and its mean drawn from it."""
+    """Rows of random kinds at instants of their own; the belief's mean is drawn from it.
+
+    All of it is correlated, or else only the states are, and the slow errors are as their priors.
+    """
     kinds = [kind for kind in kinds if agents > 1 or kind is not Kind.RANGE]
     truth, accel = builders.fly(rng, agents, ticks, DT)
     count = slow_errors.count(agents) if slow else 0
     scales = np.concatenate([np.full(6 * agents, prior_m), rng.uniform(0.05, 0.5, count)])
     covariance = scales[:, None] * builders.random_covariance(rng, 6 * agents + count) * scales
+    if not correlated:
+        covariance[6 * agents :] = covariance[:, 6 * agents :] = 0.0
+        covariance[range(6 * agents, len(scales)), range(6 * agents, len(scales))] = scales[6 * agents :] ** 2
     errors = np.linalg.cholesky(covariance) @ rng.normal(size=len(scales))
     mean = np.concatenate([truth[0], np.zeros(count)]) + errors
     belief = SlowBelief(mean, 0.5 * (covariance + covariance.T), scales[6 * agents :])

@@ -63,6 +63,29 @@ def test_on_linear_rows_its_covariance_is_that_of_the_joint_problem(seed: int) -
     np.testing.assert_array_equal(solution.variances, solution.measured)
 
 
+@pytest.mark.parametrize("kinds", [builders.LINEAR_KINDS, (Kind.VELOCITY, Kind.RANGE), (Kind.VELOCITY,)])
+@pytest.mark.parametrize("seed", [1, 3, 5, 7])
+def test_errors_that_no_row_holds_stay_what_they_were(seed: int, kinds: tuple[Kind, ...]) -> None:
+    # GIVEN a belief in which slow errors are independent, and rows that hold only some of them, or none
+    drawn = nth_window(seed, kinds=kinds, correlated=False, rows_per_agent=1)
+    rows, start = drawn.window.rows()
+    joint = drawn.joint()
+    assert not joint.coupling.any(axis=0).all()
+    optimum, solution = joint.minimise(joint.start_at_prior()), drawn.solved()
+    # THEN the solution is that over all of them
+    np.testing.assert_allclose(solution.path, optimum.path, rtol=0, atol=1e-7)
+    np.testing.assert_allclose(solution.slow, optimum.slow, rtol=0, atol=1e-7)
+    if np.isin(rows["kind"], builders.LINEAR_KINDS).all():
+        np.testing.assert_allclose(solution.covariance, joint.newest_covariance(optimum.z), rtol=0, atol=1e-9)
+        # and so is the next window's prior
+        kalman = AugmentedKalman(drawn.belief)
+        accel, accel_variance = drawn.window.inputs()
+        kalman.update(rows[: start[1]], joint.variance[: start[1]])
+        kalman.predict(accel[0], accel_variance[0])
+        np.testing.assert_allclose(solution.arrival.mean, kalman.mean, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(solution.arrival.covariance, kalman.covariance, rtol=0, atol=1e-9)
+
+
 def test_one_iteration_solves_linear_rows() -> None:
     drawn = nth_window(7, kinds=builders.LINEAR_KINDS)
     once, long = drawn.solved(iterations=1), drawn.solved()

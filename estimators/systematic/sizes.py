@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from estimators.compiled.entries import entry
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
 from estimators.model.row_kernels import POSITION
@@ -57,15 +58,8 @@ class SystematicSizes:
         self._wanders.weigh(rows, accel, accel_variance)
         self._lost_ticks += 1
         self._lost_ticks[rows["agent"][rows["kind"] == POSITION]] = 0
-        agents, moments = len(self._accel_mps2), errors**2 + variance
-        accelerations = moments[3 * agents : 6 * agents].reshape(agents, 3).mean(axis=1)
-        mixed = (1.0 - self._share) * self._accel_mps2**2 + self._share * accelerations
-        self._accel_mps2 = np.clip(np.sqrt(mixed), *ACCEL_MPS2[1:])
-        if agents > 1:
-            median = float(np.median(moments[slow_errors.pairs(agents)]))
-            told_m = float(np.sqrt((1.0 - self._share) * self._pair_m**2 + self._share * median))
-            hidden_m = min(PAIR_OF_WANDER * float(np.median(self._wanders.sizes_m()[:, :2])), PAIR_M[0])
-            self._pair_m = min(max(told_m, hidden_m, PAIR_M[1]), PAIR_M[2])
+        moments = errors**2 + variance
+        self._pair_m = _follow(moments, self._share, self._wanders.sizes_m(), self._pair_m, self._accel_mps2)
 
     def sizes(self) -> Vector:
         """Standard deviations ``(q,)`` of the slow errors."""
@@ -74,16 +68,10 @@ class SystematicSizes:
         return self._made.copy()
 
     def _make(self) -> Vector:
-        wander = self._wanders.sizes_m() ** 2
-        agents = len(wander)
-        shared = COMMON_SHARE * np.median(wander, axis=0) if agents > 1 else np.zeros(3)
+        agents = len(self._accel_mps2)
         out = np.empty(slow_errors.count(agents))
-        out[: 3 * agents] = np.sqrt(np.maximum(wander - shared, OWN_SHARE * wander)).ravel()
         tilted = np.where(self._lost_ticks > self._most_ticks, TILTED_MPS2, 0.0)
-        across = np.maximum(self._accel_mps2, tilted)
-        out[3 * agents : 6 * agents] = np.stack((across, across, self._accel_mps2), axis=1).ravel()
-        out[slow_errors.common(agents)] = np.sqrt(np.maximum(shared, 1e-6))
-        out[slow_errors.pairs(agents)] = self._pair_m
+        _fill(self._wanders.sizes_m(), self._accel_mps2, tilted, self._pair_m, out)
         return out
 
     def white_factors(self) -> Matrix:
@@ -99,3 +87,37 @@ class SystematicSizes:
         )
         lost = self._lost_ticks
         self._lost_ticks = np.array([lost[known[s]] if s in known else 0 for s in range(change.after.size)])
+
+
+@entry("float64(float64[::1], float64, float64[:, ::1], float64, float64[::1])")
+def _follow(moments: Vector, share: float, wander: Matrix, pair_m: float, accel_mps2: Vector) -> float:
+    """The size of the bias of ranges, and accel_mps2 ``(n,)`` <- those of accelerations, a tick later.
+
+    ``moments`` ``(q,)`` second ones of the estimates, of which each size takes a ``share``.
+    """
+    agents = accel_mps2.shape[0]
+    for a in range(agents):
+        total = 0.0
+        for i in range(3):
+            total += moments[3 * (agents + a) + i] / 3.0
+        size = np.sqrt((1.0 - share) * accel_mps2[a] ** 2 + share * total)
+        accel_mps2[a] = min(max(size, ACCEL_MPS2[1]), ACCEL_MPS2[2])
+    if agents < 2:
+        return pair_m
+    told = np.sqrt((1.0 - share) * pair_m**2 + share * np.median(moments[6 * agents + 3 :]))
+    hidden = min(PAIR_OF_WANDER * np.median(wander[:, :2].copy()), PAIR_M[0])
+    return float(min(max(told, hidden, PAIR_M[1]), PAIR_M[2]))
+
+
+@entry("void(float64[:, ::1], float64[::1], float64[::1], float64, float64[::1])")
+def _fill(wander: Matrix, accel_mps2: Vector, tilted: Vector, pair_m: float, out: Vector) -> None:
+    """out ``(q,)`` <- sizes of all errors; ``tilted`` ``(n,)``: of horizontal accelerations at least, m/s2."""
+    agents = wander.shape[0]
+    for i in range(3):
+        shared = COMMON_SHARE * np.median(wander[:, i] ** 2) if agents > 1 else 0.0
+        for a in range(agents):
+            square = wander[a, i] ** 2
+            out[3 * a + i] = np.sqrt(max(square - shared, OWN_SHARE * square))
+            out[3 * (agents + a) + i] = accel_mps2[a] if i == 2 else max(accel_mps2[a], tilted[a])
+        out[6 * agents + i] = np.sqrt(max(shared, 1e-6))
+    out[6 * agents + 3 :] = pair_m

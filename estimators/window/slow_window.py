@@ -237,8 +237,8 @@ def leaving_residuals(problem: SlowProblem, solution: SlowSolution, ignored: NDA
     residuals = np.empty(count)
     _residuals(plain(window), solution.path[0], solution.slow, residuals)
     variances, weights = 1.0 / precision, 1.0 / (precision * solution.measured[:count])
-    unused = np.flatnonzero(ignored_rows(rows, ignored))
-    if len(unused):
+    if ignored.any():
+        unused = np.flatnonzero(ignored_rows(rows, ignored))
         weights[unused] = 0.0
         variances[unused] = IGNORED_FACTOR * variances[unused] + _predicted(problem, solution, unused)
     return Residuals(rows, residuals**2 / variances, weights)

@@ -16,6 +16,9 @@ from estimators.systematic.slow_errors import places_before
 
 WORTHWHILE = 1.02
 """A size that has changed by less than this factor is left what it is."""
+LOOSENED = 1.1
+"""A variance beyond so much of its prior's is no longer what measurements made of it: a pair has loosened it, and a
+larger prior adds to it alone."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,8 +79,9 @@ class SlowBelief:
     def resized(self, sizes: Vector) -> SlowBelief:
         """With priors of other sizes.
 
-        A larger one adds the difference of the variances, a smaller one the difference of the informations: where
-        nothing was measured, the slow error has the new prior.
+        It is as if the slow errors had had them from the start: information changes by the difference of those of the
+        priors. What was taken for certain because a wander was taken for small is given back when it turns out large:
+        the fixes have told the sum of place and wander.
         """
         mean, covariance, known = self.mean.copy(), self.covariance.copy(), self.sizes.copy()
         _resize(self.states, sizes, mean, covariance, known)
@@ -111,12 +115,13 @@ def _resize(states: int, sizes: Vector, mean: Vector, covariance: Matrix, known:
             continue
         at, before, after = states + j, known[j] * known[j], sizes[j] * sizes[j]
         known[j] = sizes[j]
-        if after > before:
+        if after > before and covariance[at, at] > LOOSENED * before:
             covariance[at, at] += after - before
             continue
         for i in range(total):
             column[i] = covariance[at, i]
-        factor, was = 1.0 / (column[at] + 1.0 / (1.0 / after - 1.0 / before)), mean[at]
+        added, was = 1.0 / after - 1.0 / before, mean[at]
+        factor = added / max(1.0 + added * column[at], min(before / after, 1.0))
         for i in range(total):
             mean[i] -= column[i] * factor * was
             for k in range(total):

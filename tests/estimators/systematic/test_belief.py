@@ -101,31 +101,62 @@ def test_an_unmeasured_error_gets_the_new_prior(seed: int, factor: float) -> Non
     np.testing.assert_allclose(changed.mean, belief.mean, rtol=0, atol=1e-12)
 
 
-@given(seed=SEEDS, factor=st.floats(1.05, 5.0))
+def measured_belief(rng: np.random.Generator, sizes: Array) -> SlowBelief:
+    """Priors, and then some measurements of states and errors together."""
+    fresh = SlowBelief.first(rng.normal(size=12), builders.random_covariance(rng, 12), sizes)
+    rows = rng.normal(size=(20, len(fresh.mean)))
+    information = np.linalg.inv(fresh.covariance) + rows.T @ rows
+    vector = np.linalg.solve(fresh.covariance, fresh.mean) + rows.T @ rng.normal(size=20)
+    covariance = np.linalg.inv(information)
+    return SlowBelief(covariance @ vector, 0.5 * (covariance + covariance.T), sizes)
+
+
+@given(seed=SEEDS, factor=st.floats(1.05, 5.0), grows=st.booleans())
+@settings(max_examples=40)
+def test_another_prior_is_as_if_it_had_been_from_the_start(seed: int, factor: float, grows: bool) -> None:
+    # GIVEN the same measurements, after priors of two sizes
+    sizes = np.random.default_rng(seed).uniform(0.2, 2.0, slow_errors.count(2))
+    others = sizes.copy()
+    others[[1, 5, 13]] *= factor if grows else 1.0 / factor
+    one, other = (measured_belief(np.random.default_rng(seed), each) for each in (sizes, others))
+    # THEN what was learned with the one prior is turned into what the other would have taught, and back
+    changed = one.resized(others)
+    np.testing.assert_allclose(changed.covariance, other.covariance, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(changed.mean, other.mean, rtol=0, atol=1e-8)
+    np.testing.assert_array_equal(changed.sizes, others)
+    again = changed.resized(sizes)
+    np.testing.assert_allclose(again.covariance, one.covariance, rtol=0, atol=1e-8)
+    np.testing.assert_allclose(again.mean, one.mean, rtol=0, atol=1e-8)
+
+
+@given(seed=SEEDS, factor=st.floats(0.1, 10.0))
 @settings(max_examples=30)
-def test_a_smaller_prior_adds_information_and_a_larger_one_variance(seed: int, factor: float) -> None:
-    rng = np.random.default_rng(seed)
-    belief = drawn_belief(rng, 2)
-    at = 5
-    smaller, larger = belief.sizes.copy(), belief.sizes.copy()
-    smaller[at], larger[at] = belief.sizes[at] / factor, belief.sizes[at] * factor
-    information = np.linalg.inv(belief.covariance)
-    information[12 + at, 12 + at] += smaller[at] ** -2 - belief.sizes[at] ** -2
-    narrowed = belief.resized(smaller)
-    np.testing.assert_allclose(np.linalg.inv(narrowed.covariance), information, rtol=0, atol=1e-6)
-    # the information vector stays: the added information is about zero
-    vector = np.linalg.solve(belief.covariance, belief.mean)
-    np.testing.assert_allclose(np.linalg.solve(narrowed.covariance, narrowed.mean), vector, rtol=0, atol=1e-6)
-    widened = belief.resized(larger)
-    added = widened.covariance - belief.covariance
-    assert added[12 + at, 12 + at] == pytest.approx(larger[at] ** 2 - belief.sizes[at] ** 2)
-    added[12 + at, 12 + at] = 0.0
-    assert not added.any()
-    np.testing.assert_array_equal(widened.mean, belief.mean)
-    for changed, sizes in ((narrowed, smaller), (widened, larger)):
-        np.testing.assert_array_equal(changed.sizes, sizes)
-        assert np.linalg.eigvalsh(changed.covariance).min() > 0.0
-        np.testing.assert_allclose(changed.covariance, changed.covariance.T, rtol=0, atol=1e-12)
+def test_any_belief_stays_one(seed: int, factor: float) -> None:
+    # GIVEN a belief whose errors are less certain than their priors, as a neighbour's pair may leave them
+    belief = drawn_belief(np.random.default_rng(seed), 2)
+    changed = belief.resized(factor * belief.sizes)
+    assert np.linalg.eigvalsh(changed.covariance).min() > 0.0
+    assert np.isfinite(changed.mean).all()
+
+
+def test_a_place_that_hung_on_a_small_wander_is_given_back() -> None:
+    # GIVEN one drone whose fixes were believed to a centimetre, since its receiver was taken not to wander
+    sizes = np.full(slow_errors.count(1), 0.01)
+    fresh = SlowBelief.first(np.zeros(6), 100.0 * np.eye(6), sizes)
+    information = np.linalg.inv(fresh.covariance)
+    row = np.zeros(len(fresh.mean))
+    row[0], row[6 + slow_errors.wander_of(0).start] = 1.0, 1.0
+    covariance = np.linalg.inv(information + np.outer(row, row) / 1e-4)
+    belief = SlowBelief(np.zeros(len(row)), covariance, sizes)
+    assert np.sqrt(belief.covariance[0, 0]) < 0.02
+    # WHEN it turns out to wander by a metre
+    wanted = sizes.copy()
+    wanted[slow_errors.wander_of(0)] = 1.0
+    # THEN its place is uncertain by a metre, and the sum of both is what the fixes have told
+    changed = belief.resized(wanted).covariance
+    assert np.sqrt(changed[0, 0]) == pytest.approx(1.0, rel=0.01)
+    assert np.sqrt(row @ changed @ row) == pytest.approx(0.01, rel=0.01)
+    assert changed[1, 1] > 0.99**2
 
 
 @given(seed=SEEDS, order=st.permutations([0, 1, 2]))

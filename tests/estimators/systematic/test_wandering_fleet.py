@@ -137,3 +137,40 @@ def test_the_same_again_is_the_same_bit_by_bit(
     for there, here in zip(estimated(flight, EXACT, start, WORLD), expected, strict=True):
         np.testing.assert_array_equal(there.mean, here.mean)
         np.testing.assert_array_equal(there.covariance, here.covariance)
+
+
+# --- consistency ------------------------------------------------------------------------------------------------
+
+
+def consistency(
+    world: World, settings: EstimatorSettings, seeds: range, ticks: int, from_tick: int
+) -> tuple[float, float]:
+    """NEES of each drone's position over its three degrees of freedom, and position RMSE m, over the seeds."""
+    squares, errors = [], []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, 77])
+        flight = fly(world, ticks, rng)
+        start = flight.truth[0] + rng.normal(0.0, np.tile([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], world.agents))
+        estimates = estimated(flight, settings, start, world)
+        for tick in range(from_tick, ticks + 1, 5):
+            for slot in range(world.agents):
+                at = slice(6 * slot, 6 * slot + 3)
+                away = estimates[tick].mean[at] - flight.truth[tick][at]
+                squares.append(away @ np.linalg.solve(estimates[tick].covariance[at, at], away) / 3.0)
+                errors.append(away @ away)
+    return float(np.mean(squares)), float(np.sqrt(np.mean(errors)))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("wander_m", [0.0, 0.8, 1.5])
+def test_it_is_consistent_where_sensors_wander(wander_m: float) -> None:
+    # GIVEN flights of 40 s in which receivers, accelerations and ranges have slow errors
+    world = replace(WORLD, wander_m=wander_m)
+    anees, rmse_m = consistency(world, default_settings(), range(16), 200, 100)
+    # THEN the estimate knows how good it is
+    assert 0.6 < anees < 1.4
+    assert rmse_m < 0.15 + 1.5 * wander_m
+    # and without slow errors it would not where they are large
+    if wander_m > 1.0:
+        without = msgspec.structs.replace(default_settings(), systematic_errors=False)
+        assert consistency(world, without, range(4), 200, 100)[0] > 10.0

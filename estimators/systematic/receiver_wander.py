@@ -33,7 +33,7 @@ HYPOTHESES_M, FACTORS = np.tile(WANDERS_M, len(WHITES)), np.repeat(WHITES, len(W
 PRIOR_NATS = np.tile(np.log(PRIOR), len(WHITES))
 MEMORY_FIXES = 300.0
 """Fixes that are remembered, some minute of them."""
-TRUST_NATS = 5.0
+TRUST_NATS = 2.0
 """Log odds that a receiver whose white noise is all that it claims does not wander, once it has been watched."""
 WATCHED_FIXES = 40.0
 """So many fixes tell a wander: of fewer, any is as likely as another."""

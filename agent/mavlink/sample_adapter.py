@@ -158,8 +158,6 @@ class SampleAdapter:
         fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
         if message.time_usec and fix == self._last_fix:
             return self._skip("gps: sent again")
-        if self._is_frozen(fix, message):
-            return self._skip("gps: frozen")
         if not (abs(message.lat) <= 900_000_000 and abs(message.lon) <= 1_800_000_000) or (
             message.lat == 0 and message.lon == 0
         ):
@@ -175,6 +173,8 @@ class SampleAdapter:
         t_s = self._stamp(message.time_usec, arrival_s, "gps") if message.time_usec else arrival_s
         if t_s is None:
             return None
+        if self._is_frozen(fix, message):  # of what is refused for another reason, nothing is remembered
+            return self._skip("gps: frozen")
         ground, norm = self._speeds(message)
         return GpsSample(
             t_s=t_s,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -57,10 +57,11 @@ class Notebook:
         self.fail("outgoing", self.tick)
         return Payload(self.tick, np.linalg.inv(self.covariance), self.mean, 6)
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
         self.calls.append(("mix", round_, tuple(received)))
         self.mixed = dict(received)
         self.fail("mix", self.tick)
+        return ()
 
     def solve(self, budget: int | None = None) -> Estimate:
         self.fail("solve", self.tick)

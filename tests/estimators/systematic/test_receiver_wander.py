@@ -44,10 +44,11 @@ def known_after_the_flight(wander_m: float, white: float) -> tuple[Array, Array]
 @pytest.mark.parametrize(
     ("wander_m", "white", "least", "median", "most"),
     [
-        # white noise alone, as claimed or more: none (a tenth of the claim); less: the rest of the claim is wander
+        # white noise alone, as claimed or more: next to none (a fifth of the claim; odds of e^2 at most speak for such
+        # a receiver, as with e^5 one that does wander was believed); less: the rest of the claim is wander
         (0.0, 0.4, 0.3, (0.35, 0.4), 0.45),
-        (0.0, 1.0, 0.0, (0.0, 0.05), 0.1),
-        (0.0, 1.5, 0.0, (0.0, 0.05), 0.1),
+        (0.0, 1.0, 0.0, (0.0, 0.08), 0.13),
+        (0.0, 1.5, 0.0, (0.0, 0.08), 0.13),
         # half a metre, the claim's size: told where the white noise is small, in time where it is large
         (0.5, 0.4, 0.35, (0.4, 0.85), 1.0),
         (0.5, 1.0, 0.0, (0.2, 0.8), 1.0),
@@ -92,7 +93,7 @@ def spoiled(flight: WanderingFlight, what: str, rng: np.random.Generator) -> Wan
 
 
 @pytest.mark.parametrize("what", ["outliers", "jump"])
-@pytest.mark.parametrize(("wander_m", "least", "most"), [(0.0, 0.0, 0.1), (1.5, 0.7, 2.5)])
+@pytest.mark.parametrize(("wander_m", "least", "most"), [(0.0, 0.0, 0.13), (1.5, 0.7, 2.5)])
 def test_outliers_and_a_jump_are_no_wander(what: str, wander_m: float, least: float, most: float) -> None:
     for seed in range(6):
         sizes, _ = watched(spoiled(flown(seed, wander_m), what, np.random.default_rng(seed)))
@@ -104,7 +105,7 @@ def test_a_frozen_receiver_wanders_far_and_is_trusted_again_in_time() -> None:
     # GIVEN a receiver that repeats one fix for ten seconds of flight
     for seed in range(6):
         sizes, _ = watched(spoiled(flown(seed, 0.0), "freeze", np.random.default_rng(seed)))
-        assert sizes[BEFORE, 0, 0] <= 0.1
+        assert sizes[BEFORE, 0, 0] <= 0.13
         # THEN within two seconds its wander is said to be large, and it stays that until the fixes move
         assert sizes[BEFORE + 21 : AFTER, 0, 0].min() > 1.0
 

@@ -92,11 +92,16 @@ def test_default_estimator_and_gtsam_have_the_same_estimate() -> None:
     assert not fleet.missing
     assert fleet.timed_steps >= TIMED
     ours, rival = fleet.steps["dmhe_shared"], fleet.steps["gtsam_incremental"]
-    assert ours.distance_max < 1e-4
+    alike = "dmhe_shared without slow errors"
+    assert fleet.steps[alike].distance_max < 1e-4
+    # what is flown estimates more than the smoothers do
+    assert ours.distance_max < 0.1
     assert fleet.steps["gtsam_batch"].distance_max == 0.0
     assert 0.0 < ours.cpu_median_us <= ours.cpu_p99_us
     assert ours.over_ours == 1.0
-    assert fleet.over_incremental == {"dmhe_shared": pytest.approx(ours.cpu_median_us / rival.cpu_median_us)}
+    assert fleet.over_incremental == {
+        name: pytest.approx(fleet.steps[name].cpu_median_us / rival.cpu_median_us) for name in ("dmhe_shared", alike)
+    }
 
 
 @needs_gtsam
@@ -134,7 +139,7 @@ def test_without_gtsam_ours_are_timed_and_the_table_says_so(monkeypatch: pytest.
 
     monkeypatch.setattr(importlib.util, "find_spec", without_gtsam)
     (fleet,) = run_fleets(FleetPlan(seed=5, fleets=(LINE,), ticks=TIMED, rounds=1), lambda what: None)
-    assert list(fleet.steps) == ["dmhe_shared"]
+    assert list(fleet.steps) == ["dmhe_shared", "dmhe_shared without slow errors"]
     assert np.isnan(fleet.steps["dmhe_shared"].distance_max)
     (sentence,) = fleet.missing
     assert "gtsam is not installed" in sentence

@@ -44,8 +44,8 @@ def known_after_the_flight(wander_m: float, white: float) -> tuple[Array, Array]
 @pytest.mark.parametrize(
     ("wander_m", "white", "least", "median", "most"),
     [
-        # white noise alone, as claimed or more: next to none (a fifth of the claim; odds of e^2 at most speak for such
-        # a receiver, as with e^5 one that does wander was believed); less: the rest of the claim is wander
+        # white noise alone, as claimed or more: next to none, a fifth of the claim (odds of e^2 at most speak for
+        # such a receiver, as with e^5 one that does wander was believed); less: the rest of the claim is wander
         (0.0, 0.4, 0.3, (0.35, 0.4), 0.45),
         (0.0, 1.0, 0.0, (0.0, 0.08), 0.13),
         (0.0, 1.5, 0.0, (0.0, 0.08), 0.13),

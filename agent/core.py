@@ -21,7 +21,6 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import replace
 from enum import Enum, auto
 
 import numpy as np
@@ -40,7 +39,6 @@ from agent.sensing.timeline import TickInput, Timeline, tick_of
 from agent.watch.health import HealthMonitor
 from agent.watch.position_watch import PositionWatch, TickEvidence
 from estimators.estimator import Estimate
-from estimators.integrity.finding import Finding
 from estimators.integrity.solution import Solution
 from estimators.integrity.staleness import Ages, gps_lost
 from estimators.model.layout import Layout, block
@@ -336,7 +334,6 @@ class AgentCore:
             outputs.append(HealthChanged(changed))
         self.counters["ticks"] += 1
         self.counters["ticks: late"] += not on_time
-        self.counters["ticks: alarm"] += self.health.health.alarm
         self.counters[f"status: {estimate.status.name.lower()}"] += 1
         self._end_tick()
 
@@ -378,21 +375,10 @@ class AgentCore:
             Ages(
                 fix_age_s=fix_age_s,
                 imu_coverage=0.0 if self._input is None else self._input.coverage,
-                aided=self._input is None or self._input.aided,
                 heard_age_s=self.neighbours.expected_ages_s(now_s),
             ),
             autopilot=self._link_state,
             geometry=roll.geometry(self._agent_id, self._tick) if alone else None,
             location=roll.own_location if alone else (),
-            contradictions=self._contradictions(estimate),
             timing=self.gps_latency.timing,
         )
-
-    def _contradictions(self, estimate: Estimate) -> tuple[Finding, ...]:
-        """Whose fixes contradict the rest, by id, ``None`` for the own ones; counted."""
-        found = []
-        for finding in estimate.findings:
-            agent_id = None if finding.about is None else self.fleet.present[finding.about]
-            self.counters[f"ticks: fixes of {agent_id} contradict"] += 1
-            found.append(replace(finding, about=None if agent_id == self._agent_id else agent_id))
-        return tuple(found)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import Protocol
@@ -10,8 +10,6 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.integrity.finding import Finding
-from estimators.integrity.innovations import Innovations
 from estimators.model.gaussian import Prior
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
@@ -87,10 +85,6 @@ class Estimate:
     age_ticks: NDArray[np.int64]
     report: SolverReport = field(default_factory=SolverReport)
     observable: NDArray[np.bool_] = field(default_factory=lambda: np.zeros(0, np.bool_))
-    findings: tuple[Finding, ...] = ()
-    """Whose measurements contradict the rest, by slot."""
-    innovations: Innovations | None = None
-    """How well the measurements of each sensor fit; ``None`` where the algorithm does not tell."""
 
     def __post_init__(self) -> None:
         if not len(self.observable):
@@ -136,12 +130,8 @@ class Estimator(Protocol):
         """What neighbours get in this round."""
         ...
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
-        """Fuse what neighbours sent in this round, by slot; a missing neighbour is left out.
-
-        Gives the slots of those whose pair contradicts what is known here and was not used; an algorithm that does
-        not look gives none.
-        """
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
+        """Fuse what neighbours sent in this round, by slot; a missing neighbour is left out."""
         ...
 
     def solve(self, budget: int | None = None) -> Estimate:

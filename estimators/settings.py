@@ -24,8 +24,6 @@ DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
         "relay_hops": 2,
         "unknown_inputs": "hold",  # the last acceleration heard, with a variance that grows
         "held_accel_fade_s": 2.0,  # no vehicle accelerates for long
-        "systematic_errors": True,
-        "robust": True,
     }
 }
 """Defaults that go with a kind; of every other kind those of `EstimatorSettings`, which are the paper's."""
@@ -88,13 +86,6 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     iterations_ekf: Count = 1
     """Updates per tick of the centralised EKF; 1 is the plain one, more the iterated one."""
-
-    systematic_errors: bool = False
-    """Whether the wander of fixes, the bias of ranges and the error of accelerations are estimated (``dmhe_shared``),
-    of sensors without hard bounds."""
-
-    robust: bool = False
-    """Whether outliers are weighted down, by a Student-t density beyond three sigma (``dmhe_shared``)."""
 
     qp: Literal["osqp", "daqp"] = "osqp"
     """Engine of the constrained step."""

@@ -65,11 +65,7 @@ RETIRED: Mapping[str, Retired] = {
 }
 
 
-LATER: Mapping[str, object] = {
-    "transport.exchanges": 1,
-    "estimator.systematic_errors": False,
-    "estimator.robust": False,
-}
+LATER: Mapping[str, object] = {"transport.exchanges": 1}
 """Keys that came later, and what was so before them: a flight log without such a key was flown like that."""
 
 

@@ -33,9 +33,6 @@ from transport.messages.measurement_body import (
 UNMEASURED_VARIANCE = 1e6
 """Stands for an axis that was not measured (the wire has no gap); such an axis makes no row."""
 THREE_D_FIX = 3
-LEAST_SIGMA = 0.01
-"""Of any measurement, in m or m/s, whatever its owner claims: no sensor of a drone in flight is better, and a member
-whose record says so would draw all others to it. The owner's own floors are higher."""
 
 _Row = tuple[int, float, float, float, float, float, float, float, Kind, int, int, int]
 """A row in the order of `ROW`."""
@@ -96,8 +93,8 @@ def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMe
 def rows_of(records: Iterable[Measurement], slots: Mapping[int, int]) -> RowTable:
     """The rows of records of sensors, in their order; ``slots`` by agent id.
 
-    None is surer than `LEAST_SIGMA`. All in one table at once: numpy takes as long for a table of one row as for ten.
-    Raises `TypeError` for an acceleration, which is an input.
+    All in one table at once: numpy takes as long for a table of one row as for ten. Raises `TypeError` for an
+    acceleration, which is an input.
     """
     rows: list[_Row] = []
     for record in records:
@@ -120,9 +117,7 @@ def rows_of(records: Iterable[Measurement], slots: Mapping[int, int]) -> RowTabl
                 rows.append((tick, record.offset_s, record.range_m, *noise, *record.anchor_m, kind, slot, -1, slot))
             case AccelerationMeasurement():
                 raise TypeError(f"an acceleration is an input, not a measurement: {record}")
-    table = np.array(rows, ROW)
-    np.maximum(table["variance"], LEAST_SIGMA**2, out=table["variance"])
-    return table
+    return np.array(rows, ROW)
 
 
 def inputs_of(records: Iterable[AccelerationMeasurement], slots: Mapping[int, int]) -> InputTable:

@@ -19,7 +19,6 @@ from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
 from estimators.consensus.mapping import mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
-from estimators.integrity.innovations import Innovations
 from estimators.model.gaussian import Prior
 from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
 from estimators.model.measurements import InputTable, Matrix, Vector, empty_inputs, input_rows
@@ -72,8 +71,6 @@ class FleetTracker:
         self.roll = Membership(config, agent_id)
         self.present: tuple[int, ...] = ()
         """Whom the latest estimate speaks of, in the order of its blocks."""
-        self.innovations: Innovations | None = None
-        """Of the latest estimate, in the same order."""
 
     @property
     def started(self) -> bool:
@@ -138,8 +135,7 @@ class FleetTracker:
                         centre = np.asarray(np.linalg.solve(own.information, own.vector), np.float64)
                     pair = mapped_payload(pair, message.agents, self.roll.members, centre)
                 pairs[self.roll.members.index(sender)] = pair
-        for slot in self._estimator.mix(round_, pairs):
-            self._counters[f"information: refused of {self.roll.members[slot]}"] += 1
+        self._estimator.mix(round_, pairs)
 
     def solve(self) -> Estimate:
         """The estimate of the tick, over the members."""
@@ -149,7 +145,7 @@ class FleetTracker:
             raise ArithmeticError("the estimate is not finite or its covariance not positive")
         self._counters["estimate moved"] += estimate.report.moves
         self._good = _Good(estimate, self.roll.members, self.roll.own_located)
-        self.present, self.innovations = self.roll.members, estimate.innovations
+        self.present = self.roll.members
         self.roll.note_estimate(estimate)
         if not self.roll.own_located and estimate.status in (Status.OK, Status.NOT_CONVERGED, Status.NO_DATA):
             estimate = replace(estimate, status=Status.NOT_OBSERVABLE)
@@ -159,7 +155,7 @@ class FleetTracker:
         """The estimate of the own drone before the start: nothing known, and saying so."""
         covariance = ABSENT_VARIANCE * np.eye(STATES_PER_AGENT)
         age = np.array([MAX_AGE_TICKS])
-        self.present, self.innovations = (self._agent_id,), None
+        self.present = (self._agent_id,)
         return Estimate(tick, np.zeros(STATES_PER_AGENT), covariance, Status.NO_DATA, age, SolverReport())
 
     def fall_back(self, tick: int) -> Estimate:
@@ -169,7 +165,7 @@ class FleetTracker:
             self.forget()
             return self.nothing(tick)
         good = self._good
-        self.present, self.innovations = good.members, None
+        self.present = good.members
         self.roll.return_to(good.members, own_located=good.own_located)
         mean, covariance = self._carried(good.estimate, tick)
         return Estimate(tick, mean, covariance, Status.FELL_BACK, good.estimate.age_ticks, SolverReport())

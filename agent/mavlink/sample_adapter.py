@@ -26,11 +26,6 @@ UNIX_US = 10**15
 """A ``time_usec`` above this is Unix time (after 2001), below it time since boot."""
 GPS_SIGMA_FLOOR_M = 0.02
 """Least 1-sigma of a fix, whatever the receiver claims: RTK is no better than its antenna's phase centre."""
-FROZEN_FIXES = 3
-"""A fix that has come so often in a row, to the last digit of position and velocity, is no new measurement."""
-MOVING_MPS = 0.5
-"""Above it a fix that repeats contradicts its own velocity: its next one is many of its digits away. A receiver at
-rest may say the same for long, as some filter their output."""
 GPS_SPEED_SIGMA_MPS = 0.3
 """Where the receiver does not report a speed accuracy."""
 GPS_RANGE_ERROR_M = 2.5
@@ -41,10 +36,6 @@ MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
 
 StampS = Callable[[float, float], float | None]
 """(boot time, arrival) to fleet time in s; ``None`` if it cannot be told."""
-
-
-_AIDED = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ_ABS
-"""Flags of which an aided estimator has one: they go at once with the fix, those of its estimate after seconds."""
 
 
 class SampleAdapter:
@@ -62,29 +53,19 @@ class SampleAdapter:
         self._epoch_unix_s = epoch_unix_s
         self._fleet_time_of_boot = fleet_time_of_boot
         self._last_preferred_s: dict[str, float] = {}
-        self._last_fix: tuple[int, ...] = ()
-        """Time, place and velocity, as sent."""
-        self._repeats = 0
-        """How often the last fix has come again, with another time."""
+        self._last_fix: tuple[int, int, int, int] | None = None
         self.flavour = "other"
         """``ardupilot``, ``px4`` or ``other``, set by the owner once the autopilot is known: only ArduPilot scales
         RAW_IMU, and the sensors of each are late in their own way."""
         self.fix_type = 0
         """The receiver's last word on its fix."""
-        self.aided = True
-        """Whether the autopilot's own estimator is aided by positions, by its last word."""
-        self._was_aided = False
-        self.frozen = False
-        """Whether the receiver repeats a fix that its own velocity contradicts."""
         self.skipped: Counter[str] = Counter()
 
     def reset(self) -> None:
         """Forget the streams seen, as after a reboot."""
         self._last_preferred_s.clear()
-        self._last_fix, self._repeats, self.frozen = (), 0, False
+        self._last_fix = None
         self.fix_type = 0
-        self.aided = True
-        self._was_aided = False
 
     def convert(self, message: Message, arrival_s: float) -> Sample | None:
         """The sample of a message that arrived at fleet time ``arrival_s``; ``None`` if it gives none."""
@@ -131,7 +112,7 @@ class SampleAdapter:
             return self._skip("attitude: no unit quaternion")
         self._last_preferred_s["attitude"] = arrival_s
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
-        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
+        return None if t_s is None else AttitudeSample(t_s, quaternion)
 
     def _attitude(self, message: Message, arrival_s: float) -> Sample | None:
         if not self._is_second_choice_due("attitude", arrival_s):
@@ -140,14 +121,7 @@ class SampleAdapter:
             return self._skip("attitude: not finite")
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
         quaternion = from_euler(message.roll, message.pitch, message.yaw)
-        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
-
-    def _estimator_status(self, message: Message, _arrival_s: float) -> Sample | None:
-        """ESTIMATOR_STATUS and EKF_STATUS_REPORT have the same flags for what is asked here."""
-        aided = bool(message.flags & _AIDED) and not message.flags & mavlink.ESTIMATOR_CONST_POS_MODE
-        self._was_aided = self._was_aided or aided
-        self.aided = aided or not self._was_aided  # before its first position it stands still: gravity levels it
-        return None
+        return None if t_s is None else AttitudeSample(t_s, quaternion)
 
     # --- GPS -----------------------------------------------------------------------------------------------
 
@@ -155,11 +129,10 @@ class SampleAdapter:
         self.fix_type = message.fix_type
         if not self._sensors.gps_min_fix <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP:
             return self._skip("gps: no fix")
-        fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
+        fix = (message.time_usec, message.lat, message.lon, message.alt)
         if message.time_usec and fix == self._last_fix:
             return self._skip("gps: sent again")
-        if self._is_frozen(fix, message):
-            return self._skip("gps: frozen")
+        self._last_fix = fix
         if not (abs(message.lat) <= 900_000_000 and abs(message.lon) <= 1_800_000_000) or (
             message.lat == 0 and message.lon == 0
         ):
@@ -187,14 +160,6 @@ class SampleAdapter:
             fix_type=message.fix_type,
             latency=gps_prior(self.flavour, _stamp_kind(message.time_usec), self._sensors),
         )
-
-    def _is_frozen(self, fix: tuple[int, ...], message: Message) -> bool:
-        """Whether the receiver repeats itself though it says that it moves; remembers the fix."""
-        self._repeats = self._repeats + 1 if fix[1:] == self._last_fix[1:] else 0
-        self._last_fix = fix
-        moves = message.vel != UNKNOWN_16 and message.vel * 1e-2 > MOVING_MPS
-        self.frozen = moves and self._repeats >= FROZEN_FIXES - 1
-        return self.frozen
 
     def _accuracy_m(self, accuracy_mm: int, dilution_centi: int) -> float | None:
         """1-sigma in m: the receiver's own, else from the dilution of precision (which is not metres).
@@ -271,6 +236,4 @@ _CONVERTERS: dict[int, Callable[[SampleAdapter, Message, float], Sample | None]]
     mavlink.MAVLINK_MSG_ID_ATTITUDE: SampleAdapter._attitude,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: SampleAdapter._gps_raw_int,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: SampleAdapter._local_position_ned,
-    mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: SampleAdapter._estimator_status,
-    mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: SampleAdapter._estimator_status,
 }

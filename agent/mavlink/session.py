@@ -33,12 +33,6 @@ _NOT_VEHICLES = {
 }
 LOCAL_POSITION_HZ = 2.0
 """For comparison only, never a measurement."""
-ESTIMATOR_STATUS_HZ = 2.0
-"""Whether the autopilot's attitude is aided: an attitude without positions is tilted within a second."""
-_ESTIMATOR_STATUS = {
-    "px4": mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
-    "ardupilot": mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT,
-}
 
 
 class LinkState(StrEnum):
@@ -193,8 +187,6 @@ class AutopilotSession:
             self.samples.flavour = flavour
             self.state = LinkState.CONNECTED
             self.rates.restart(now_s)
-            if flavour in _ESTIMATOR_STATUS:
-                self.rates.add(_ESTIMATOR_STATUS[flavour], ESTIMATOR_STATUS_HZ)
 
     def _on_stranger(self, message: Message) -> None:
         self.ignored["other source"] += 1

@@ -24,11 +24,10 @@ class ImuSample:
 
 @dataclass(frozen=True, slots=True)
 class AttitudeSample:
-    """Attitude of the body; ``aided``: not without position, when an autopilot takes its own motion for gravity."""
+    """Attitude of the body."""
 
     t_s: float
     quaternion: Quaternion
-    aided: bool = True
 
 
 @dataclass(frozen=True, slots=True)

@@ -19,7 +19,6 @@ from typing import TypeVar
 from agent.config.tables import SensorsTable
 from agent.sensing.frames import interpolated, rotated
 from agent.sensing.samples import AttitudeSample, ImuSample, Quaternion, Triple
-from estimators.model.unknown_motion import TILTED_MPS2
 
 TICK_ROUNDING = 1e-6
 """Instants this share of a tick before a tick's start belong to it: k T is not exact in floating point."""
@@ -55,8 +54,6 @@ class TickInput:
     variance: Triple
     coverage: float
     samples: int
-    aided: bool = True
-    """Whether the attitudes were those of an autopilot with positions."""
 
 
 class Timeline:
@@ -96,11 +93,9 @@ class Timeline:
             return TickInput(tick, (0.0, 0.0, 0.0), (spread, spread, spread), 0.0, 0)
         coverage = min(covered_s / self._period_s, 1.0)
         uncovered = 1.0 - coverage if 1.0 - coverage > TICK_ROUNDING else 0.0
-        aided = all(sample.aided for sample in self._attitudes if start_s <= sample.t_s < end_s)
-        tilted = 0.0 if aided else TILTED_MPS2**2
-        variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2 + tilted
+        variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2
         north, east, down = (component / covered_s for component in integral)
-        return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside, aided)
+        return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside)
 
     def attitude_at(self, t_s: float, gyro_radps: Triple) -> Quaternion | None:
         """The attitude at an instant; ``None`` without a sample close enough.

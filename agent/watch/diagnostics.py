@@ -15,7 +15,6 @@ import numpy as np
 
 from agent.onboard import OnboardAgent
 from agent.watch.health import Health
-from estimators.model.measurements import Kind
 from transport.messages.header import MAX_BODY_BYTES, PacketKind
 from transport.messages.report_body import Diagnostics
 
@@ -116,11 +115,9 @@ def gauges_of(onboard: OnboardAgent, now_s: float) -> dict[str, float]:
     gauges = {
         "rtt_s": session.clock.rtt_s,
         "gps_fix_type": float(session.samples.fix_type),
-        "gps_frozen": float(session.samples.frozen),
         "gps_age_s": core.gps_age_s(now_s),
         "gps_latency_s": core.gps_latency.latency_s,
         "gps_latency_sigma_s": core.gps_latency.sigma_s,
-        **nis_gauges(onboard, onboard.agent_id),
         **rates,
     }
     return {name: value for name, value in gauges.items() if value is not None and math.isfinite(value)}
@@ -132,33 +129,7 @@ def neighbour_gauges(onboard: OnboardAgent, host_s: float, now_s: float) -> dict
     peers = {str(agent_id): peer.as_dict(host_s) for agent_id, peer in opener.peers.items()}
     for agent_id, age_s in core.neighbours.ages_s(now_s).items():
         peers[str(agent_id)]["heard_age_s"] = age_s
-    return {
-        agent_id: gauges | nis_gauges(onboard, int(agent_id))
-        for agent_id, gauges in peers.items()
-        if int(agent_id) in core.neighbours
-    }
-
-
-def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
-    """How well an agent's measurements fit the estimate (`estimators.integrity.innovations`): about 1 if as claimed.
-
-    Of the own agent the ranges to all others, of another those between it and the own one. What was not measured is
-    left out.
-    """
-    fleet = onboard.core.fleet
-    innovations, present = fleet.innovations, fleet.present
-    if innovations is None or agent_id not in present:
-        return {}
-    slot, own = present.index(agent_id), present.index(onboard.agent_id)
-    squares = innovations.squares[slot]
-    nis = {
-        "nis_gps_position": squares[Kind.POSITION],
-        "nis_gps_velocity": squares[Kind.VELOCITY],
-        "nis_gps_speed": squares[Kind.SPEED],
-        "nis_ranges": squares[Kind.RANGE] if slot == own else innovations.pairs[own, slot],
-        "weight_gps_position": innovations.weights[slot, Kind.POSITION],
-    }
-    return {name: round(float(value), 3) for name, value in nis.items() if math.isfinite(value)}
+    return {agent_id: peers[agent_id] for agent_id in peers if int(agent_id) in core.neighbours}
 
 
 def diagnostics_of(

@@ -6,7 +6,7 @@ found here. `agent.watch.health` says it in words.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.latency_doubt import FixTiming, LatencyMonitor
@@ -30,8 +30,6 @@ class TickEvidence:
     """Of the own ranges, where they alone have to hold the position: after the start, without GPS."""
     location: tuple[Finding, ...] = ()
     """What the search for the own place by ranges found, where that is what the start waits for."""
-    contradictions: tuple[Finding, ...] = ()
-    """Whose fixes the estimator found to contradict the rest, by id, ``None`` for the own ones."""
     timing: FixTiming | None = None
     """Of the latest fix; ``None`` before the first."""
 
@@ -52,15 +50,10 @@ class PositionWatch:
             found += (*self._geometry.observe(evidence.geometry), *evidence.location)
         if evidence.autopilot != CONNECTED:
             found.append(Finding(What.AUTOPILOT, Gravity.DEGRADED, detail=evidence.autopilot))
-        found += (replace(each, detail=_fixes_of(each.about)) for each in evidence.contradictions)
         found += self._staleness.observe(evidence.ages)
         if evidence.timing is not None:
             found += self._latency.observe(evidence.timing)
         return tuple(sorted(found, key=lambda each: each.what.value))
-
-
-def _fixes_of(agent_id: int | None) -> str:
-    return "fixes" if agent_id is None else f"fixes of {agent_id}"
 
 
 def clock_finding(fault: str | None) -> tuple[Finding, ...]:

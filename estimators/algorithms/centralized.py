@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -106,7 +106,7 @@ class CentralizedEkf:
         """A centralised filter has no neighbours."""
         raise RuntimeError("a centralised filter exchanges nothing (rounds is 0)")
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         """A centralised filter has no neighbours."""
         raise RuntimeError("a centralised filter exchanges nothing (rounds is 0)")
 

@@ -7,7 +7,7 @@ rows there, and one prediction later an arbitrary one.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 
@@ -163,11 +163,10 @@ class DistributedEkf:
         """The corrected pair after ``round_`` rounds."""
         return self._consensus.outgoing()
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         """One round of consensus on information. Pairs of another tick are not used."""
         for slot in self._consensus.mix(round_, received):
             self.window.hear(slot, self.window.last)
-        return ()
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Mean and covariance of the fused pair; ``budget`` is not used, nothing iterates."""

@@ -6,7 +6,7 @@ move, else time 0 would be the prior of the window that starts at 1).
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 
 from estimators.consensus.fusion import Fusion
 from estimators.consensus.rank import WindowRank
@@ -76,11 +76,10 @@ class MovingHorizonEstimator:
         """The information pair (11)-(12) after ``round_`` rounds."""
         return self._consensus.outgoing()
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
         """One round of (13)-(14); at the very first tick there is no window to solve, and nothing is fused."""
         for slot in self._consensus.mix(round_, received, fuse=self.window.begun):
             self.window.hear(slot, self.window.first)
-        return ()
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Solve the window (5)-(10), move the arrival cost (17)-(18); the covariance is the pre-estimation's (22)."""

@@ -1,11 +1,9 @@
 """Moving horizon estimation over everything the fleet shared (``dmhe_shared``), see docs/algorithms.md.
 
-A fixed-lag smoother over the last N ticks, as the field calls it, run on every drone. Measurements and inputs travel
-over hops, so that the window of every agent holds what the fleet measured and each solves the central problem. It is
-solved over its first state alone, the exact form of the paper's estimator with EKF pre-estimation
-(`estimators.window.first_state`), together with the slow errors of the sensors (`estimators.systematic`), and with
-outliers weighted down. The arrival cost is filtered, so that nothing is used twice; consensus on its states only
-repairs what was lost on the way: the slow errors follow from the same measurements everywhere and do not travel.
+A fixed-lag smoother over the last N ticks, as the field calls it, run on every drone. Records and inputs travel over
+hops, so that the window of every agent holds what the fleet measured and each solves the central problem. The window
+is DMHE-1's (input corrections as variables); its arrival cost is filtered, so that nothing is used twice; consensus
+on it only repairs what was lost on the way.
 
 What an arrival cost holds is never linearised anew. So a range between places that are not known well enters it
 with what its linearisation misses (`estimators.model.second_order`), and monitors keep other places in mind
@@ -14,42 +12,30 @@ with what its linearisation misses (`estimators.model.second_order`), and monito
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from estimators.algorithms.shared_monitors import Belief, SharedMonitors
 from estimators.consensus.inheritance import Inheritance
-from estimators.estimator import Estimate, Payload, SolverReport, Status
+from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.ambiguity import Body, body_of
-from estimators.integrity.finding import Finding, What
-from estimators.integrity.innovations import InnovationMonitor
-from estimators.model.gaussian import Pair, Prior, symmetrised
+from estimators.model.gaussian import Prior, symmetrised
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
-from estimators.model.members import MemberChange
+from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
-from estimators.systematic.belief import SlowBelief
-from estimators.systematic.sizes import SystematicSizes
-from estimators.systematic.slow_errors import corrected_rows
-from estimators.window.arrival_cost import first_estimate
-from estimators.window.assembly import open_window
-from estimators.window.problem import WindowProblem
-from estimators.window.slow_window import (
-    SlowProblem,
-    SlowSolution,
-    continued,
-    leaving_residuals,
-    slow_problem,
-    solve_slow,
-)
+from estimators.window.arrival_cost import filtered_arrival, first_estimate
+from estimators.window.assembly import open_window, window_problem
+from estimators.window.solving import solve_window
 
 
 class SharedMovingHorizonEstimator:
     """One agent's ``dmhe_shared``; arguments as in `estimators.factory.make_estimator`.
 
-    A measurement window, the belief about its start, inheritance as consensus on it, and the monitors.
+    A measurement window, the filtered arrival cost, inheritance as consensus on it, and the monitors.
     """
 
     fixed_members = False
@@ -69,19 +55,11 @@ class SharedMovingHorizonEstimator:
         self.period_s = period_s
         self.rounds = settings.rounds
         self.window = open_window(settings, layout, period_s)
-        self._sizes = SystematicSizes(layout.size, period_s) if settings.systematic_errors else None
-        mean, covariance = np.array(prior_mean, float), symmetrised(np.asarray(prior_covariance, float))
-        self.belief = SlowBelief.first(mean, covariance, self._present_sizes())
-        """About the window's start, before consensus."""
-        self._own: Pair = self.belief.kinematic().pair()
-        """Its states alone."""
-        self._last: SlowSolution | None = None
-        """Of the tick before, to start from."""
+        self.arrival = InformationState.from_moments(prior_mean, prior_covariance)
+        """Belief about the window's start before consensus."""
         self._consensus = Inheritance(slot)
-        self._innovations = InnovationMonitor(layout.size, slot, period_s)
-        self._monitors = SharedMonitors(
-            layout, slot, body_of(mean, covariance, slot), period_s, settings.norm_smoothing_m
-        )
+        own = body_of(self.arrival.mean, symmetrised(np.asarray(prior_covariance, float)), slot)
+        self._monitors = SharedMonitors(layout, slot, own, period_s, settings.norm_smoothing_m)
 
     @property
     def dropped(self) -> int:
@@ -102,137 +80,53 @@ class SharedMovingHorizonEstimator:
         """Open a tick: slide the window and insert what arrived."""
         self.window.open(tick)
         self.window.insert(measurements, inputs)
-        self._own = self.belief.kinematic().pair()
-        self._consensus.begin(self.window.first, self._own)
+        self._consensus.begin(self.window.first, self.arrival.pair())
 
     def outgoing(self, round_: int) -> Payload:
-        """The states of the own arrival cost, with what was inherited in ``round_`` rounds."""
+        """The own arrival cost, with what was inherited in ``round_`` rounds."""
         return self._consensus.outgoing()
 
-    def mix(self, round_: int, received: Mapping[int, Payload]) -> Collection[int]:
-        """Inherit from each neighbour's pair what it knows better; nothing at the very first tick.
-
-        Gives whose pair does not fit the own one (`estimators.consensus.inheritance`).
-        """
+    def mix(self, round_: int, received: Mapping[int, Payload]) -> None:
+        """Inherit from each neighbour's pair what it knows better; nothing at the very first tick."""
         for slot in self._consensus.mix(received, fuse=self.window.begun):
             self.window.hear(slot, self.window.first)
-        return self._consensus.disbelieved
 
     def solve(self, budget: int | None = None) -> Estimate:
         """Solve the window, filter it for the next arrival cost, and let the monitors look at both."""
         if not self.window.begun:
-            return first_estimate(self.window, self.belief.kinematic())
-        pair = self._consensus.pair()
-        if pair is not self._own:
-            self.belief = self.belief.with_pair(self._own, pair)
-        problem, solution = self._solved(budget)
-        self._learn(problem, solution)
-        contradictions = self._contradictions(problem, solution)
-        states = self.belief.states
-        covariance = symmetrised(solution.covariance[:states, :states])
-        belief = Belief(solution.path, covariance, solution.arrival.kinematic())
-        rows, measured = self._seen(problem, solution)
-        verdict = self._monitors.look(rows, measured, belief, slide=self.window.full)
-        observable = verdict.observable
-        for finding in contradictions:
-            if finding.what is What.FIXES_CONTRADICT:
-                observable[finding.about] = False
-        self.belief, self._last = solution.arrival, solution
-        if verdict.moves:
-            moved = verdict.belief.arrival
-            self.belief, self._last = solution.arrival.with_states(moved.mean, moved.covariance()), None
+            return first_estimate(self.window, self.arrival)
+        slide, eps = self.window.full, self.settings.norm_smoothing_m
+        problem = window_problem(self.window, self._consensus.pair(), self.slot, self.period_s, False)
+        solution = solve_window(problem, self.settings, budget)
+        filtered = filtered_arrival(problem, solution.path, eps, slide=slide)
+        belief = Belief(solution.path, filtered.covariance, filtered.arrival)
+        verdict = self._monitors.look(problem._replace(rows=filtered.rows), problem.rows, belief, slide=slide)
+        self.arrival = verdict.belief.arrival
         return Estimate(
             self.window.last,
             verdict.belief.path[-1],
             verdict.belief.covariance,
-            self._status(solution.converged, len(problem.rows) > 0, bool(observable[self.slot])),
+            self._status(solution.status, len(problem.rows) > 0, bool(verdict.observable[self.slot])),
             self.window.ages(),
-            SolverReport(iterations=solution.iterations, cost=solution.cost, moves=verdict.moves),
-            observable,
-            contradictions,
-            self._innovations.averages(),
+            replace(solution.report, moves=verdict.moves),
+            verdict.observable,
         )
-
-    def _solved(self, budget: int | None) -> tuple[SlowProblem, SlowSolution]:
-        """The window's problem and its solution, begun where the last one ended."""
-        settings = self.settings
-        white = np.ones((self.layout.size, 3))
-        if self._sizes is not None:
-            self.belief, white = self.belief.resized(self._present_sizes()), self._sizes.white_factors()
-        problem = slow_problem(
-            self.window,
-            self.belief,
-            white,
-            self.period_s,
-            settings.norm_smoothing_m,
-            robust=settings.robust,
-            ignored=self._innovations.ignored,
-        )
-        path, slow = self.belief.mean[None, : self.belief.states], self.belief.mean[self.belief.states :]
-        if self._last is not None:
-            slid = len(self._last.path) - len(problem.window.accel)
-            path, slow = self._last.path[slid:], self._last.slow
-        guess = continued(path, problem, slow), slow
-        limit = settings.max_iterations if budget is None else min(budget, settings.max_iterations)
-        return problem, solve_slow(
-            problem, self.belief, guess, limit, settings.tolerance, slide=self.window.full
-        )
-
-    def _learn(self, problem: SlowProblem, solution: SlowSolution) -> None:
-        """Let the sizes of slow errors follow what leaves the window."""
-        if self._sizes is None or not self.window.full:
-            return
-        window, states = problem.window, self.belief.states
-        leaving, variance = problem.rows[: window.start[1]], solution.covariance.diagonal()[states:]
-        self._sizes.learn(leaving, window.accel[0], window.accel_variance[0], solution.slow, variance)
-
-    def _contradictions(self, problem: SlowProblem, solution: SlowSolution) -> tuple[Finding, ...]:
-        """Whose fixes do not fit the rest, as the rows that leave the window say."""
-        if not (self.settings.robust and self.window.full):
-            return ()
-        monitor = self._innovations
-        return monitor.observe(leaving_residuals(problem, solution, monitor.ignored))
-
-    def _seen(self, problem: SlowProblem, solution: SlowSolution) -> tuple[WindowProblem, RowTable]:
-        """The window as the monitors see it, less its slow errors, and its rows without what linearisations miss."""
-        window, states = problem.window, self.belief.states
-        variance = solution.covariance.diagonal()[states:]
-        rows = problem.rows.copy()
-        rows["variance"] = solution.measured
-        measured = corrected_rows(rows, window.slow_at, window.slow_by, solution.slow, variance)
-        seen = measured.copy()
-        seen["variance"] += solution.variances - solution.measured
-        pair = self._own
-        return (
-            WindowProblem(
-                seen, window.start, window.accel, window.accel_variance, *pair,
-                np.array([self.slot], np.int64), self.period_s, False,
-            ),
-            measured,
-        )  # fmt: skip
-
-    def _present_sizes(self) -> Vector:
-        return np.zeros(0) if self._sizes is None else self._sizes.sizes()
 
     @staticmethod
-    def _status(converged: bool, has_rows: bool, observable: bool) -> Status:
-        if not observable:
-            return Status.NO_DATA if not has_rows and converged else Status.NOT_OBSERVABLE
-        if not converged:
-            return Status.NOT_CONVERGED
-        return Status.OK if has_rows else Status.NO_DATA
+    def _status(solved: Status, has_rows: bool, observable: bool) -> Status:
+        if solved is Status.OK and not has_rows:
+            return Status.NO_DATA
+        if not observable and solved in (Status.OK, Status.NOT_CONVERGED):
+            return Status.NOT_OBSERVABLE
+        return solved
 
     def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
         """Let agents join and leave, see `estimators.estimator.Estimator`."""
         change = MemberChange.between(self.layout, agents, own, fresh)
-        if self._sizes is not None:
-            self._sizes.change_members(change)
-        self.belief = self.belief.reindexed(change, self._present_sizes())
-        self._last = None
+        self.arrival = self.arrival.reindexed(change)
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)
         self._consensus.change_members(change)
-        self._innovations.change_members(change)
         prior = change.fresh.get(self.slot)
         self._monitors.change_members(change, None if prior is None else self._at_last_tick(prior))
 

@@ -47,16 +47,10 @@ class What(Enum):
     """The fleet turned out to be the mirror image of the estimate."""
     CONTRADICTORY = auto()
     """No place explains the measurements."""
-    FIXES_CONTRADICT = auto()
-    """A drone's fixes and the rest of what was measured do not fit together."""
-    FIXES_IGNORED = auto()
-    """A drone's fixes do not fit the rest, and the position has been held without them for a while."""
     AUTOPILOT = auto()
     """The link to the autopilot is not there."""
     IMU_GAP = auto()
     """The IMU was silent for a part of the tick."""
-    UNAIDED = auto()
-    """The autopilot's attitude is that of an estimator without positions: it tilts."""
     NO_FIX = auto()
     """No position fix of late."""
     SILENT = auto()

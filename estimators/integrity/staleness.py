@@ -19,8 +19,6 @@ class Ages:
     """Share of the latest tick, 0..1, that the IMU vouches for."""
     heard_age_s: Mapping[int, float] = field(default_factory=dict)
     """Since each neighbour that should be heard was, by id; ``inf``: never."""
-    aided: bool = True
-    """Whether the attitude in the latest tick was that of an autopilot with positions."""
 
 
 class StalenessMonitor:
@@ -35,8 +33,6 @@ class StalenessMonitor:
         coverage, timeout_s = evidence.imu_coverage, self._neighbour_timeout_s
         if coverage < MIN_IMU_COVERAGE:
             found.append(Finding(What.IMU_GAP, Gravity.DEGRADED, value=coverage, limit=MIN_IMU_COVERAGE))
-        if not evidence.aided:
-            found.append(Finding(What.UNAIDED, Gravity.DEGRADED))
         if gps_lost(evidence.fix_age_s):
             found.append(Finding(What.NO_FIX, Gravity.DEGRADED, value=evidence.fix_age_s, limit=GPS_LOST_S))
         for agent, age_s in evidence.heard_age_s.items():

@@ -78,22 +78,6 @@ CERTAIN_NATS = 24.0
 FEWEST_MIRRORED = 4
 """Fewer drones are in one plane, and are their own mirror image."""
 
-# --- sensors that contradict all others ----------------------------------------------------------------------
-
-CONTRADICTING_SQUARE = 3.0
-"""Average normalised squared residual of a receiver's rows from which on they contradict the rest. Over 45 unit
-normals, three seconds of fixes five times a second, it exceeds 1.8 once in a thousand; and what a receiver claims is
-seldom right to a factor of 1.3."""
-AGREEING_SQUARE = 1.5
-"""The same from which down they agree again."""
-IGNORED_SQUARE = 4.0
-"""The same from which on they get no weight: later than they are told of, so that one outlier takes nothing away."""
-FEWEST_WITNESSES = 3
-"""Drones whose receivers do not contradict: of fewer nobody can tell which of them is wrong."""
-SETTLED_S = 10.0
-"""So long after its fixes have lost their weight a position is taken to have got over them: in a flight whose
-receiver is dragged away by 0.5 m/s its error is within its covariance after eight."""
-
 # --- latency ------------------------------------------------------------------------------------------------
 
 LATENCY_SHARE = 1.0

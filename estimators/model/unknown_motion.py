@@ -6,9 +6,6 @@ import math
 
 MANOEUVRE_S = 3.0
 """How long an acceleration that is not known lasts."""
-TILTED_MPS2 = 0.35
-"""1-sigma per horizontal axis of an acceleration whose attitude is that of an autopilot without positions: 2 degrees
-of tilt. On PX4 1.9 to 2.6 degrees were measured, 0.33 to 0.45 m/s2, in one direction for 20 s."""
 
 
 def silence_sigma_m(silent_s: float, accel_variance: float, period_s: float) -> float:

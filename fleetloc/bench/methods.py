@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-import msgspec
-
 from estimators.settings import EstimatorSettings, default_settings, present_name
 from fleetloc.errors import InputError
 from sim_bridge.studies.genie import Genie
@@ -28,21 +26,16 @@ def default_methods(other_accel_variance: float = UNKNOWN_ACCEL_VARIANCE) -> dic
         "dekf_ci": EstimatorSettings(kind="dekf_ci", other_accel_variance=q),
         "dekf_ci_shared": EstimatorSettings(kind="dekf_ci", share_inputs="neighbours", other_accel_variance=q),
         "dmhe_pre_ekf_shared": EstimatorSettings(share_inputs="neighbours", other_accel_variance=q),
-        FLAGSHIP: flagship_settings(),
+        FLAGSHIP: default_settings(),
         CENTRALISED: EstimatorSettings(kind="centralized_ekf", iterations_ekf=20),
     }
-
-
-def flagship_settings() -> EstimatorSettings:
-    """What is flown by default, told that a study's sensors have no errors but their bounded noise."""
-    return msgspec.structs.replace(default_settings(), systematic_errors=False)
 
 
 def methods_with_genie() -> dict[str, Method]:
     """The same with the genie of the flagship's model beside it."""
     methods = default_methods()
     centralised = methods.pop(CENTRALISED)
-    return {**methods, GENIE: Genie(flagship_settings()), CENTRALISED: centralised}
+    return {**methods, GENIE: Genie(default_settings()), CENTRALISED: centralised}
 
 
 def chosen(methods: Mapping[str, Method], names: str, always: Sequence[str] = ()) -> dict[str, Method]:

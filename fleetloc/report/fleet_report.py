@@ -109,19 +109,13 @@ def _of_counters(lives: list[Diagnostics]) -> dict[str, Any]:
     for life in lives:
         total.update(life.counters)
     sensors = counted_sensors(total)
-    gauges = lives[-1].gauges if lives else {}
     if lives:  # of the last daemon: the latency that it assumes, or has estimated on line
+        gauges = lives[-1].gauges
         sensors["gps"] |= {
             "latency_s": gauges.get("gps_latency_s"),
             "latency_sigma_s": gauges.get("gps_latency_sigma_s"),
         }
-    fit = {name: value for name, value in gauges.items() if name.startswith(("nis_", "weight_"))}
-    return {
-        "ticks_alarm": total["ticks: alarm"],
-        "fit": fit,
-        "packets": counted_packets(total),
-        "sensors": sensors,
-    }
+    return {"packets": counted_packets(total), "sensors": sensors}
 
 
 def counted_packets(total: Counter[str]) -> dict[str, Any]:

@@ -154,8 +154,6 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
             | _of_errors(compared.errors[phase.name])
             for phase in results.phases[agent_id]
         },
-        "ticks_alarm": counters["ticks: alarm"],
-        "fit": replayed.fit[agent_id].figures(),
         "packets": counted_packets(counters),
         "sensors": sensors,
         "counters": dict(sorted(counters.items())),

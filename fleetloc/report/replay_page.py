@@ -7,7 +7,7 @@ from typing import Any
 
 from fleetloc.extras import is_installed, sentence
 from fleetloc.report.replay_figures import ReplayResults
-from fleetloc.report.replay_tables import cautions, error_table, fit_table, log_table
+from fleetloc.report.replay_tables import cautions, error_table, log_table
 from fleetloc.report.report_html import CSS, counted
 from fleetloc.report.style import NO_PLOTS, colour
 from fleetloc.run.replay_run import Replayed
@@ -47,9 +47,6 @@ def drawn_sections(
         ("Errors", "In metres. Horizontal and whole errors of each drone's estimate of itself against the truth, per "
          "part of the run; ANEES of the state of the fleet and of the own state: 1 is right, more is overconfident.",
          _table(*error_table(figures))),
-        ("Fit", "Mean and largest of the normalised squared residuals of each drone's sensors and of the ranges to "
-         "each neighbour, averaged over three seconds, a residual counting 10 at most: about 1 if a sensor is as "
-         "good as it claims; the weights of fixes are 1 for all that is no outlier.", _table(*fit_table(figures))),
         ("Logs", "Samples that were used, and content that was not, by reason.", _table(*log_table(figures))),
     ]  # fmt: skip
     return tables + _plots(prepared, replayed, results, figures) if is_installed("report") else tables

@@ -65,24 +65,6 @@ def error_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     return columns, rows
 
 
-def fit_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows: normalised squared residuals by agent and sensor, mean and largest."""
-    names = sorted({name for agent in figures["agents"] for name in agent["fit"]})
-    columns = ["agent", *(name.removeprefix("nis_").replace("_", " ") for name in names), "ticks with alarm"]
-    rows = [
-        [
-            str(agent["id"]),
-            *(
-                f"{shown(fit['mean'], 2)} / {shown(fit['max'], 2)}" if fit is not None else "-"
-                for fit in (agent["fit"].get(name) for name in names)
-            ),
-            str(agent["ticks_alarm"]),
-        ]
-        for agent in figures["agents"]
-    ]
-    return columns, rows
-
-
 def cautions(figures: dict[str, Any]) -> list[str]:
     """What a reader of the figures must know of them."""
     sentences = []

@@ -15,8 +15,7 @@ import gc
 import re
 import sys
 import time
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,7 +27,6 @@ from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.samples import AutopilotEstimate, GpsSample
-from agent.watch.diagnostics import nis_gauges
 from estimators.factory import make_estimator
 from fleetloc.output import progress_bar
 from fleetloc.report.replay_exports import MCAP
@@ -45,7 +43,6 @@ KINDS = ("truth", "autopilot", "gps", "gps_received")
 """References, each with a track per agent."""
 UNKNOWN_HEIGHT = float("nan")
 LATENCY_EVERY_S = 1.0
-FIT_EVERY_S = 1.0
 RARE_COLLECTIONS = (100_000, 50, 100)
 """Thresholds of the collector while samples stream through: they leave no cycles, and looking for some is a tenth."""
 _OF_A_REPLAY = re.compile(rf"agent_[0-9]{{3}}\.csv|({'|'.join(KINDS)})_[0-9]{{3}}\.track|{re.escape(MCAP)}")
@@ -78,30 +75,6 @@ class Replayed:
     cpu_s: float
     latency: dict[int, Thinned] = field(default_factory=dict)
     """By agent: fleet time, latency of its GPS in s, 1-sigma; empty where it is not estimated."""
-    fit: dict[int, FitTotals] = field(default_factory=dict)
-    """By agent: how well its measurements fitted."""
-
-
-@dataclass(slots=True)
-class FitTotals:
-    """Mean and maximum over a run of figures that come once a second, by name."""
-
-    seconds: Counter[str] = field(default_factory=Counter)
-    sums: dict[str, float] = field(default_factory=dict)
-    most: dict[str, float] = field(default_factory=dict)
-
-    def add(self, figures: Mapping[str, float]) -> None:
-        """Take in those of a second."""
-        for name, value in figures.items():
-            self.seconds[name] += 1
-            self.sums[name] = self.sums.get(name, 0.0) + value
-            self.most[name] = max(value, self.most.get(name, value))
-
-    def figures(self) -> dict[str, dict[str, float]]:
-        """``mean`` and ``max`` by name."""
-        return {
-            name: {"mean": self.sums[name] / count, "max": self.most[name]} for name, count in self.seconds.items()
-        }
 
 
 class ReferenceTracks:
@@ -141,8 +114,6 @@ class ReplayWriter:
 
     def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
         self.latency: dict[int, Thinned] = {}
-        self.fit = {agent_id: FitTotals() for agent_id in agents}
-        self._fit_s: dict[int, float] = {}
         self._noted_s: dict[int, float] = {}
         self._recorders: dict[int, EstimateLogWriter] = {}
         fleet = config.fleet
@@ -158,12 +129,9 @@ class ReplayWriter:
             self._recorders[agent_id] = EstimateLogWriter(record, header, sys.maxsize)
 
     def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
-        """Write an estimate, and note now and then the latency, and how well the measurements fit."""
+        """Write an estimate, and note the latency now and then."""
         agent_id = agent.agent_id
         self._recorders[agent_id].write(ready, ready.ready_s, 0.0)
-        if ready.ready_s >= self._fit_s.get(agent_id, 0.0):
-            self._fit_s[agent_id] = ready.ready_s + FIT_EVERY_S
-            self.fit[agent_id].add(fit_of_ranges_and_fixes(agent))
         if ready.ready_s < self._noted_s.get(agent_id, 0.0) + LATENCY_EVERY_S:
             return
         known = agent.core.gps_latency
@@ -200,16 +168,4 @@ def run_replay(prepared: Prepared, directory: Path) -> Replayed:
         results.close()
         gc.set_threshold(*usual)
         gc.unfreeze()
-    return Replayed(
-        counts, time.monotonic() - began_s, time.process_time() - cpu_s, results.latency, results.fit
-    )
-
-
-def fit_of_ranges_and_fixes(agent: OnboardAgent) -> dict[str, float]:
-    """How well the agent's measurements fit now, and by neighbour the ranges between the two."""
-    found = nis_gauges(agent, agent.agent_id)
-    for neighbour in agent.core.layout.agents:
-        ranges = nis_gauges(agent, neighbour).get("nis_ranges") if neighbour != agent.agent_id else None
-        if ranges is not None:
-            found[f"nis_ranges_{neighbour}"] = ranges
-    return found
+    return Replayed(counts, time.monotonic() - began_s, time.process_time() - cpu_s, results.latency)

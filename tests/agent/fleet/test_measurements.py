@@ -86,16 +86,6 @@ def test_anchors_and_accelerations_keep_their_numbers() -> None:
         rows_of([acceleration_measurement(2, closed)], SLOTS)
 
 
-def test_no_row_is_surer_than_a_sensor_can_be_whatever_its_record_claims() -> None:
-    records = [
-        PositionMeasurement(1, 3, (1.0, 2.0, -3.0), (4e-15, 0.04, 1e-5)),
-        RangeMeasurement(1, 3, 2, 8.0, 1e-9),
-        SpeedMeasurement(1, 3, 2.0, 1e-9),
-    ]
-    variances = rows_of(records, {1: 0, 2: 1})["variance"]
-    assert variances == pytest.approx([1e-4, 0.04, 1e-4, 1e-4, 1e-4])
-
-
 def test_rows_are_those_of_the_estimators_builders() -> None:
     bounds = (0.5, 0.6, math.inf)
     records: list[Measurement] = [

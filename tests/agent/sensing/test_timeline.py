@@ -14,7 +14,6 @@ from hypothesis import strategies as st
 from agent.sensing.frames import from_euler, rotated
 from agent.sensing.samples import AttitudeSample, ImuSample, Quaternion
 from agent.sensing.timeline import ACCEL_GAP_SIGMA_MPS2, MAX_SAMPLES, TickInput, Timeline, tick_of
-from estimators.model.unknown_motion import TILTED_MPS2
 from tests.agent.conftest import fleet_config
 from tests.support.holding import held
 from tests.support.onboard import onboard_of
@@ -186,16 +185,3 @@ def test_consecutive_ticks_share_no_time_and_miss_none() -> None:
     expected = math.cos(1.0) - math.cos(10.0)
     assert max(b - a for a, b in pairwise(inside)) < 0.05
     assert velocity == pytest.approx(expected, abs=2e-3)
-
-
-def test_an_attitude_without_aiding_is_taken_for_tilted_at_once() -> None:
-    made = timeline()
-    fill(made, 0.0, 0.25)
-    for i in range(13, 26, 2):
-        made.add_attitude(AttitudeSample(0.02 * i + 0.001, (1, 0, 0, 0), aided=False))
-    fill(made, 0.25, 0.5)
-    first, later = made.close(0), made.close(4)
-    assert first.aided
-    assert not later.aided
-    assert first.accel_mps2 == pytest.approx(later.accel_mps2)
-    assert np.sqrt(later.variance) == pytest.approx([math.hypot(0.1, TILTED_MPS2)] * 3)

@@ -7,7 +7,6 @@ import math
 import numpy as np
 import pytest
 
-from agent.watch.health import assess
 from agent.watch.position_watch import PositionWatch, TickEvidence, clock_finding
 from estimators.estimator import Status
 from estimators.integrity.finding import Finding, Gravity, What
@@ -38,11 +37,7 @@ def test_everything_that_is_wrong_is_found_at_once_in_the_order_of_telling() -> 
         "lost",
         TWO_RANGED,
         (Finding(What.AMBIGUOUS, Gravity.ALARM, value=1, limit=0),),
-        contradictions=(
-            Finding(What.FIXES_CONTRADICT, Gravity.ALARM, value=5.0, limit=3.0),
-            Finding(What.FIXES_IGNORED, Gravity.DEGRADED, 3, 5.0, 3.0),
-        ),
-        timing=FixTiming(latency_sigma_s=0.1, speed_mps=20.0, sigma_m=1.0, refused=True),
+        FixTiming(latency_sigma_s=0.1, speed_mps=20.0, sigma_m=1.0, refused=True),
     )
     watch = PositionWatch(1.0)
     watch.observe(TickEvidence(WELL, FRESH, "connected"))  # aligned
@@ -51,8 +46,6 @@ def test_everything_that_is_wrong_is_found_at_once_in_the_order_of_telling() -> 
         What.AMBIGUOUS,
         What.TOO_FEW_RANGED,
         What.NOT_OBSERVABLE,
-        What.FIXES_CONTRADICT,
-        What.FIXES_IGNORED,
         What.AUTOPILOT,
         What.IMU_GAP,
         What.NO_FIX,
@@ -73,11 +66,3 @@ def test_a_clock_outside_the_fleets_time_is_a_finding_and_a_right_one_none() -> 
     (finding,) = clock_finding("clock at 2001-09-09, outside the fleet's time")
     assert (finding.what, finding.gravity) == (What.CLOCK, Gravity.DEGRADED)
     assert finding.detail.startswith("clock at 2001")
-
-
-def test_whose_fixes_contradict_is_told_in_words() -> None:
-    own = Finding(What.FIXES_CONTRADICT, Gravity.ALARM, value=5.0, limit=3.0)
-    other = Finding(What.FIXES_IGNORED, Gravity.DEGRADED, 3, 5.0, 3.0)
-    health = assess(PositionWatch(1.0).observe(TickEvidence(WELL, FRESH, "connected", contradictions=(own, other))))
-    assert health.alarm
-    assert health.reasons == ("fixes contradict the rest", "fixes of 3 contradict the rest, not used")

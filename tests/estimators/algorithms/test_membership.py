@@ -24,13 +24,9 @@ DT = 0.1
 KINDS = ["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci"]
 
 
-TOLERANCE = 1e-10
-"""Of the solver: below what is compared."""
-
-
 def settings(kind: str) -> EstimatorSettings:
     hold: Any = "hold" if kind == "dmhe_shared" else "zero"
-    return EstimatorSettings(kind=kind, window=3, rounds=0, unknown_inputs=hold, tolerance=TOLERANCE)  # type: ignore[arg-type]
+    return EstimatorSettings(kind=kind, window=3, rounds=0, unknown_inputs=hold)  # type: ignore[arg-type]
 
 
 class Flight:

@@ -210,7 +210,7 @@ ratio_at_most = 1e-6
     (row,) = json.loads(found.read_text())["rows"]
     assert (row["row"], row["hit"], row["from_s"], row["to_s"]) == ("jump", [3], 4.0, 5.0)
     assert row["before"]["position_ratio_all"] == pytest.approx(1.0)  # the same flight up to the fault
-    assert row["during"]["position_ratio_hit"] != pytest.approx(1.0, rel=1e-3)  # it is another flight from then on
+    assert row["during"]["position_ratio_hit"] > 1.0
     assert row["during"]["availability"] == 1.0
     assert any(each.startswith("ratio ") for each in row["misses"])
     assert "jump" in capsys.readouterr().out

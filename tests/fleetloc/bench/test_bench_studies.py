@@ -10,21 +10,13 @@ import numpy as np
 import pytest
 
 from estimators.estimator import Status
-from estimators.settings import EstimatorSettings
+from estimators.settings import EstimatorSettings, default_settings
 from fleetloc import cli
 from fleetloc.bench import partition as parts
 from fleetloc.bench.accuracy import sweep_points
 from fleetloc.bench.blind import CASES, blind_row
 from fleetloc.bench.links import CHANNELS, points
-from fleetloc.bench.methods import (
-    CENTRALISED,
-    FLAGSHIP,
-    GENIE,
-    chosen,
-    default_methods,
-    flagship_settings,
-    methods_with_genie,
-)
+from fleetloc.bench.methods import CENTRALISED, FLAGSHIP, GENIE, chosen, default_methods, methods_with_genie
 from fleetloc.errors import InputError
 from sim_bridge.studies.air import Air, lossy
 from sim_bridge.studies.genie import Genie
@@ -45,8 +37,8 @@ def test_methods_are_chosen_by_name() -> None:
 
 def test_the_genie_has_the_flagships_model() -> None:
     methods = methods_with_genie()
-    assert methods[FLAGSHIP] == flagship_settings()
-    assert methods[GENIE] == Genie(flagship_settings())
+    assert methods[FLAGSHIP] == default_settings()
+    assert methods[GENIE] == Genie(default_settings())
     assert set(methods) == {*default_methods(), GENIE}
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from estimators.estimator import Status
-from estimators.settings import EstimatorSettings
-from fleetloc.bench.methods import flagship_settings
+from estimators.settings import EstimatorSettings, default_settings
 from sim_bridge.studies.air import lossy
 from sim_bridge.studies.flown import fly_recording
 from sim_bridge.studies.genie import Genie
@@ -82,7 +81,7 @@ def test_it_repeats_bit_by_bit() -> None:
 @pytest.mark.slow
 def test_no_worse_than_the_flown_estimator_it_bounds() -> None:
     # GIVEN the same runs over bad links, flown
-    settings, figures = flagship_settings(), []
+    settings, figures = default_settings(), []
     for run in range(4):
         recording = StudyScenario(samples=60).record(9, run)
         assert recording.truth is not None

@@ -44,6 +44,8 @@ class Reason(StrEnum):
     """The same packet again; harmless, networks do that."""
     REPLAY = "replay"
     """Older than the replay window, or of an earlier start of its sender."""
+    REPEATED = "repeated"
+    """Its sender says of one tick after the other the same, bit by bit."""
     STALE = "stale"
     """Its clock is too far from ours."""
     WRONG_ANSWER = "wrong_answer"

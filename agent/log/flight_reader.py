@@ -23,7 +23,8 @@ from agent.log.tlog import read_frames
 
 MAX_RECORD_BYTES = 64 * 1024 * 1024
 _BROKEN = (
-    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError
+    McapError, msgspec.MsgspecError, zstandard.ZstdError, struct.error, ValueError, KeyError, OverflowError,
+    MemoryError,  # a length that a flipped bit has made huge
 )  # fmt: skip
 """What a file that is cut off or damaged makes the reader raise."""
 

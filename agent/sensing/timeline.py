@@ -29,6 +29,15 @@ ACCEL_GAP_SIGMA_MPS2 = 1.1547
 """1-sigma of the acceleration while no IMU sample came: uniform in +-2 m/s2, as of other drones by default."""
 ATTITUDE_MAX_AGE_S = 0.3
 """An IMU sample without an attitude this close is a gap: carried further with the turn rate, tilt errors show."""
+PINNED_SAMPLES = 6
+"""So many samples in a row with one and the same large component: the accelerometer is at its limit, or hangs."""
+NOISE_STEPS = 5.0
+"""A component changes by more of its own steps than this on average, or it repeats by chance, as that of an IMU whose
+values come in thousandths of g."""
+USUAL_SHARE = 0.02
+"""Of a sample in the average change."""
+PINNED_MPS2 = 4.0
+"""Components below this are no limit, and where values come in steps they may well repeat."""
 _Sample = TypeVar("_Sample", ImuSample, AttitudeSample)
 _time_of = attrgetter("t_s")
 
@@ -59,6 +68,39 @@ class TickInput:
     """Whether the attitudes were those of an autopilot with positions."""
 
 
+class _Limit:
+    """Notices an accelerometer at its limit: a component that had noise stays what it is, and large."""
+
+    def __init__(self) -> None:
+        self._last: Triple = (math.nan, math.nan, math.nan)
+        self._times = [0, 0, 0]
+        """How often each component has been what it is, in a row."""
+        self._least = [math.inf, math.inf, math.inf]
+        """Smallest change of each from sample to sample: the step in which its values come."""
+        self._usual = [0.0, 0.0, 0.0]
+        """Average change of each of late, m/s2."""
+
+    def take(self, force_mps2: Triple) -> bool:
+        """The next sample's specific force in the body's axes; whether it is at the limit."""
+        for axis, value in enumerate(force_mps2):
+            change = abs(value - self._last[axis])
+            self._times[axis] = 1 if change != 0.0 else self._times[axis] + 1
+            if change > 0.0:
+                self._least[axis] = min(self._least[axis], change)
+            if change >= 0.0 and self._times[axis] < PINNED_SAMPLES:
+                self._usual[axis] += USUAL_SHARE * (change - self._usual[axis])
+        self._last = force_mps2
+        return any(self._holds(axis) for axis in range(3))
+
+    def is_at(self, force_mps2: Triple) -> bool:
+        """Whether an earlier sample is of the same run."""
+        return any(self._holds(axis) and value == self._last[axis] for axis, value in enumerate(force_mps2))
+
+    def _holds(self, axis: int) -> bool:
+        noisy = self._usual[axis] > NOISE_STEPS * self._least[axis]
+        return noisy and self._times[axis] >= PINNED_SAMPLES and abs(self._last[axis]) >= PINNED_MPS2
+
+
 class Timeline:
     """The IMU and attitude samples of the last moments; ``skipped`` counts those not used, by reason."""
 
@@ -69,11 +111,15 @@ class Timeline:
         self._imu: list[ImuSample] = []
         self._attitudes: list[AttitudeSample] = []
         self._closed_until_s = -math.inf
+        self._limit = _Limit()
         self.skipped: Counter[str] = Counter()
 
     def add_imu(self, sample: ImuSample) -> None:
-        """Take in an IMU sample, in any order."""
-        if sample.t_s < self._closed_until_s - self._sensors.imu_max_gap_s:
+        """Take in an IMU sample, in any order; those of an accelerometer at its limit are as good as none."""
+        if self._limit.take(sample.specific_force_mps2):
+            self.skipped["imu: at its limit"] += 1
+            self._imu = [kept for kept in self._imu if not self._limit.is_at(kept.specific_force_mps2)]
+        elif sample.t_s < self._closed_until_s - self._sensors.imu_max_gap_s:
             self.skipped["imu: late"] += 1
         elif not _insert(self._imu, sample):
             self.skipped["imu: duplicate"] += 1

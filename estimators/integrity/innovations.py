@@ -6,6 +6,9 @@ else agrees is wrong about its drone's place, or all others are: the estimate ma
 enough other receivers are left to tell (`FEWEST_WITNESSES`), its rows get no weight at all: a Student-t density
 weighs an outlier down, but a pull that lasts moves the estimate. They are still looked at, against what the estimate
 without them predicts, and count again once they agree.
+
+The ranges of a pair whose ends both have fixes that fit better than they do are left out in the same way: a path
+around an obstacle, or a bias that nobody has calibrated, is far more common than two receivers that err alike.
 """
 
 from __future__ import annotations
@@ -31,8 +34,30 @@ MEMORY_S = 3.0
 """Of the averages."""
 LARGEST_SHARE = 0.2
 """Of one tick's rows in an average: one outlier of a slow sensor is no contradiction."""
+RECENT_S = 1.0
+"""A drone without a fix for longer is not held by fixes."""
 LARGEST_SQUARE = 10.0
 """A residual counts as this at most: an average tells whether many are large, not how large one was."""
+
+
+@dataclass(frozen=True, slots=True)
+class Ignored:
+    """Whose measurements are to get no weight."""
+
+    receivers: NDArray[np.bool_]
+    """``(n,)``: fixes and velocities of these agents."""
+    pairs: NDArray[np.bool_]
+    """``(n, n)``, symmetric: ranges between two agents."""
+
+    def rows(self, rows: RowTable) -> NDArray[np.bool_]:
+        """Which of the rows ``(m,)`` these are."""
+        receiver = np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.SPEED)) & self.receivers[rows["agent"]]
+        ranged = rows["kind"] == Kind.RANGE
+        return np.asarray(receiver | (ranged & self.pairs[rows["agent"], np.where(ranged, rows["other"], 0)]))
+
+    def any(self) -> bool:
+        """Whether there are any."""
+        return bool(self.receivers.any() or self.pairs.any())
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +84,8 @@ class Innovations:
     """``(n, n)``: normalised squared residuals of the ranges between two agents, symmetric."""
     ignored: NDArray[np.bool_]
     """``(n,)``: whose fixes and velocities get no weight."""
+    ignored_pairs: NDArray[np.bool_]
+    """``(n, n)``, symmetric: whose ranges get none."""
 
 
 class _Averages:
@@ -105,9 +132,11 @@ class InnovationMonitor:
         self._pairs = _Averages(agents * agents, self._period_s)
         self.contradictory = np.zeros(agents, np.bool_)
         """``(n,)``: whose fixes contradict the rest."""
-        self.ignored = np.zeros(agents, np.bool_)
-        """``(n,)``: whose fixes and velocities are to get no weight."""
+        self.ignored = Ignored(np.zeros(agents, np.bool_), np.zeros((agents, agents), np.bool_))
+        """What is to get no weight."""
         self._ignored_s = np.zeros(agents)
+        self._unfixed_s = np.full(agents, np.inf)
+        """``(n,)``: since the last fix."""
 
     def observe(self, evidence: Residuals) -> tuple[Finding, ...]:
         """A finding about each slot whose fixes contradict the rest, an alarm where it is the own one."""
@@ -115,7 +144,8 @@ class InnovationMonitor:
         squares = self._sensors.values[0].reshape(-1, KINDS)[:, [Kind.POSITION, Kind.VELOCITY]].max(axis=1)
         limit = np.where(self.contradictory, AGREEING_SQUARE, CONTRADICTING_SQUARE)
         self.contradictory = squares > limit
-        self._ignore(squares)
+        self.ignored = Ignored(self._ignored_receivers(squares), self._ignored_pairs(evidence.rows, squares))
+        self._ignored_s = np.where(self.ignored.receivers, self._ignored_s + self._period_s, 0.0)
         return tuple(
             self._finding(int(slot), float(squares[slot]), float(limit[slot]))
             for slot in np.flatnonzero(self.contradictory)
@@ -131,21 +161,22 @@ class InnovationMonitor:
         """As they are now."""
         agents = len(self.contradictory)
         squares, weights = self._sensors.told().reshape(2, agents, KINDS)
-        pairs = self._pairs.told()[0].reshape(agents, agents)
-        return Innovations(squares, weights, np.where(np.tri(agents, dtype=np.bool_), pairs.T, pairs), self.ignored)
+        pairs = _symmetric(self._pairs.told()[0], agents)
+        return Innovations(squares, weights, pairs, self.ignored.receivers, self.ignored.pairs)
 
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet; of fresh agents nothing is remembered."""
-        before = self._sensors, self._pairs, self.contradictory, self.ignored, self._ignored_s
+        before = self._sensors, self._pairs, self.contradictory, self.ignored, self._ignored_s, self._unfixed_s
         self._slot, agents, old = change.own, change.after.size, change.before.size
         self._make(agents)
         for slot, was in change.stayed.items():
-            self.contradictory[slot], self.ignored[slot] = before[2][was], before[3][was]
-            self._ignored_s[slot] = before[4][was]
+            self.contradictory[slot], self.ignored.receivers[slot] = before[2][was], before[3].receivers[was]
+            self._ignored_s[slot], self._unfixed_s[slot] = before[4][was], before[5][was]
             for kind in range(KINDS):
                 self._sensors.keep(before[0], slot * KINDS + kind, was * KINDS + kind)
             for other, other_was in change.stayed.items():
                 self._pairs.keep(before[1], _pair(slot, other, agents), _pair(was, other_was, old))
+                self.ignored.pairs[slot, other] = before[3].pairs[was, other_was]
 
     def _average(self, evidence: Residuals) -> None:
         """Ranges count for both of their ends, and for the pair."""
@@ -159,14 +190,30 @@ class InnovationMonitor:
         pairs = np.minimum(one[ranged], other) * agents + np.maximum(one[ranged], other)
         self._pairs.take(pairs, evidence.squares[ranged], evidence.weights[ranged])
 
-    def _ignore(self, squares: Vector) -> None:
+    def _ignored_receivers(self, squares: Vector) -> NDArray[np.bool_]:
         """Rows lose their weight where enough other receivers tell, and regain it once they agree."""
-        ignored = self.ignored & self.contradictory
+        ignored = self.ignored.receivers & self.contradictory
         witnesses = len(squares) - np.count_nonzero(self.contradictory)
         for slot in np.flatnonzero(self.contradictory & ~ignored & (squares > IGNORED_SQUARE)):
             ignored[slot] = witnesses >= FEWEST_WITNESSES
-        self.ignored = ignored
-        self._ignored_s = np.where(ignored, self._ignored_s + self._period_s, 0.0)
+        return np.asarray(ignored)
+
+    def _ignored_pairs(self, rows: RowTable, squares: Vector) -> NDArray[np.bool_]:
+        """Ranges lose their weight where fixes that fit hold both ends, and regain it once they agree."""
+        agents = len(squares)
+        self._unfixed_s += self._period_s
+        self._unfixed_s[rows["agent"][rows["kind"] == Kind.POSITION]] = 0.0
+        held = (self._unfixed_s <= RECENT_S) & ~self.contradictory
+        pairs = _symmetric(self._pairs.values[0], agents)
+        worse = pairs > np.maximum(squares[:, None], squares[None, :])
+        begin = (pairs > IGNORED_SQUARE) & worse & held[:, None] & held[None, :]
+        return np.asarray(begin | (self.ignored.pairs & (pairs > AGREEING_SQUARE) & held[:, None] & held[None, :]))
+
+
+def _symmetric(pairs: Vector, agents: int) -> Matrix:
+    """What stands above the diagonal of ``(n, n)``, on both sides."""
+    square = pairs.reshape(agents, agents)
+    return np.asarray(np.where(np.tri(agents, dtype=np.bool_), square.T, square))
 
 
 def _pair(one: int, other: int, agents: int) -> int:

@@ -8,15 +8,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, plain
-from estimators.integrity.innovations import Residuals
-from estimators.model.layout import STATES_PER_AGENT
+from estimators.integrity.innovations import Ignored, Residuals
+from estimators.integrity.observability import row_jacobian
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.motion import predict_mean
 from estimators.model.row_kernels import (
     HALF_WIDTH,
     POSITION,
     PRECISION,
-    SPEED,
     VALUE,
     VELOCITY,
     IntArray,
@@ -85,11 +84,11 @@ def slow_problem(
     eps: float,
     *,
     robust: bool,
-    ignored: NDArray[np.bool_] | None = None,
+    ignored: Ignored | None = None,
 ) -> SlowProblem:
     """The problem of a window with a belief about its start; ``white`` ``(n, 3)``: see `SystematicSizes`.
 
-    ``ignored`` ``(n,)``: whose fixes and velocities get no weight; absent = nobody's.
+    ``ignored``: what gets no weight; absent = nothing.
     """
     rows, start = window.rows()
     rows = np.ascontiguousarray(rows)
@@ -99,7 +98,7 @@ def slow_problem(
     group = np.empty(len(rows), np.int64)
     _encode(rows, agents, np.ascontiguousarray(np.clip(white, *WHITE)), code, data, group)
     if ignored is not None and ignored.any():
-        data[ignored_rows(rows, ignored), PRECISION] *= IGNORED_FACTOR
+        data[ignored.rows(rows), PRECISION] *= IGNORED_FACTOR
     if len(belief.sizes):
         at, by = slow_errors.couplings(rows, agents)
         push_at, push_by = np.arange(3 * agents, 6 * agents), np.ones(3 * agents)
@@ -221,16 +220,10 @@ def weights(problem: SlowProblem, solution: SlowSolution) -> NDArray[np.float64]
     return np.asarray(1.0 / (problem.window.data[:, PRECISION] * solution.measured))
 
 
-def ignored_rows(rows: RowTable, ignored: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Which rows ``(m,)`` are fixes and velocities of agents that are ``ignored`` ``(n,)``."""
-    receiver = np.isin(rows["kind"], (POSITION, VELOCITY, SPEED))
-    return np.asarray(receiver & ignored[rows["agent"]])
-
-
-def leaving_residuals(problem: SlowProblem, solution: SlowSolution, ignored: NDArray[np.bool_]) -> Residuals:
+def leaving_residuals(problem: SlowProblem, solution: SlowSolution, ignored: Ignored) -> Residuals:
     """The rows of the window's first tick, which have been weighed for good, against its solution.
 
-    Those of ``ignored`` agents ``(n,)`` are held against the estimate without them: its variance counts too.
+    Those that are ``ignored`` are held against the estimate without them: its variance counts too.
     """
     window, count = problem.window, int(problem.window.start[1])
     rows, precision = problem.rows[:count], window.data[:count, PRECISION]
@@ -238,19 +231,17 @@ def leaving_residuals(problem: SlowProblem, solution: SlowSolution, ignored: NDA
     _residuals(plain(window), solution.path[0], solution.slow, residuals)
     variances, weights = 1.0 / precision, 1.0 / (precision * solution.measured[:count])
     if ignored.any():
-        unused = np.flatnonzero(ignored_rows(rows, ignored))
+        unused = np.flatnonzero(ignored.rows(rows))
         weights[unused] = 0.0
         variances[unused] = IGNORED_FACTOR * variances[unused] + _predicted(problem, solution, unused)
     return Residuals(rows, residuals**2 / variances, weights)
 
 
 def _predicted(problem: SlowProblem, solution: SlowSolution, which: NDArray[np.int64]) -> Vector:
-    """Variances of what a solution predicts for rows of fixes and velocities, those at ``which``."""
+    """Variances of what a solution predicts for rows of the first tick, those at ``which``."""
     rows, covariance = problem.rows[which], solution.covariance
     gradients = np.zeros((len(which), len(covariance) + 1))
-    velocity = np.where(rows["kind"] == POSITION, 0, 3)
-    for i, axis in enumerate("xyz"):
-        gradients[np.arange(len(which)), STATES_PER_AGENT * rows["agent"] + velocity + i] = rows[axis]
+    gradients[:, : solution.path.shape[1]] = row_jacobian(rows, solution.path[0], problem.window.eps)[1]
     at, by = problem.window.slow_at[which], problem.window.slow_by[which]
     states = solution.path.shape[1]
     np.put_along_axis(gradients, np.where(at >= 0, states + at, len(covariance)), by, axis=1)

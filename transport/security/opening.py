@@ -24,6 +24,7 @@ from transport.messages.measurement_body import decode_measurements
 from transport.messages.reassembly import Reassembler
 from transport.messages.report_body import decode_diagnostics
 from transport.security.auth import Trust, Unsigned, verify
+from transport.security.repeat_guard import RepeatGuard
 from transport.security.replay_guard import ReplayGuard
 from transport.security.sealing import Message
 
@@ -83,6 +84,7 @@ class Opener:
         self._freshness_ns = None if freshness_s is None else round(freshness_s * 1e9)
         self.replay = replay or ReplayGuard()
         self._on_rejected = on_rejected
+        self._repeats = RepeatGuard()
         self.peers = PeerTable(self._roster - {own_id})
         self._reassembler = Reassembler(self._roster, self._count_expired)
         if not isinstance(trust, Unsigned):
@@ -119,6 +121,7 @@ class Opener:
         if not isinstance(self._trust, Unsigned):
             verify(self._trust[header.sender], key, packet)
         self.replay.commit(header)
+        self._repeats.check(header, body)
         message = self._decode(header, body, now)
         self.peers.accepted(header, now)
         if message is None:

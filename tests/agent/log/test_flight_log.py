@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from nacl.signing import SigningKey
 
@@ -221,6 +221,7 @@ def test_a_record_cut_off_at_any_byte_gives_its_beginning(
 
 @settings(max_examples=60, deadline=None)
 @given(at=st.floats(0, 1, exclude_max=True), bit=st.integers(0, 7))
+@example(at=0.6881471318712251, bit=3)  # in a length: more than there is memory
 def test_a_flipped_bit_in_the_mcap_is_noticed_or_harmless(
     short_flight: tuple[Path, list[Input]], tmp_path_factory: pytest.TempPathFactory, at: float, bit: int
 ) -> None:

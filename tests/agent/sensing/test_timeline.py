@@ -199,3 +199,37 @@ def test_an_attitude_without_aiding_is_taken_for_tilted_at_once() -> None:
     assert not later.aided
     assert first.accel_mps2 == pytest.approx(later.accel_mps2)
     assert np.sqrt(later.variance) == pytest.approx([math.hypot(0.1, TILTED_MPS2)] * 3)
+
+
+@given(st.integers(0, 2), st.sampled_from([-1.0, 1.0]), st.floats(5.0, 160.0))
+def test_an_accelerometer_at_its_limit_is_as_good_as_none(axis: int, sign: float, limit_mps2: float) -> None:
+    # GIVEN one component that stays at a limit for a second while the others have noise
+    made, rng, closed = timeline(), random.Random(3), []
+    for i in range(307):
+        value = [rng.gauss(0.0, 0.3), rng.gauss(0.0, 0.3), rng.gauss(-GRAVITY, 0.3)]
+        if 100 <= i < 200:
+            value[axis] = sign * limit_mps2
+        made.add_imu(ImuSample(0.01 * i, (value[0], value[1], value[2]), (0, 0, 0)))
+        made.add_attitude(AttitudeSample(0.01 * i, (1, 0, 0, 0)))
+        if i % 10 == 6 and i > 10:  # as a tick is closed some time after its end
+            closed.append(made.close(i // 10 - 1))
+    # THEN the accelerations of that second are unknown, its first samples among them, and no others
+    assert made.skipped["imu: at its limit"] == 95
+    for each in closed:
+        assert each.coverage == (pytest.approx(0.0 if 10 <= each.tick < 20 else 1.0, abs=0.5))
+        assert max(map(abs, each.accel_mps2)) < 1.0
+
+
+def test_values_in_coarse_steps_repeat_by_chance() -> None:
+    made, rng, step = timeline(), random.Random(4), 0.0098
+    for i in range(2000):
+        down = step * round(rng.gauss(-GRAVITY, 0.3 * step) / step)
+        made.add_imu(ImuSample(0.01 * i, (step * rng.randrange(30), 0.0, down), (0, 0, 0)))
+    assert not made.skipped
+
+
+def test_an_imu_without_noise_that_stands_still_or_turns_is_not_at_its_limit() -> None:
+    made = timeline()
+    fill(made, 0.0, 0.5, (0.0, 0.0, 0.0))
+    assert made.close(4).coverage == pytest.approx(1.0, abs=1e-6)
+    assert not made.skipped

@@ -29,9 +29,14 @@ def residuals(squares: dict[int, float], ranges: dict[tuple[int, int], float] | 
     return Residuals(np.concatenate(tables), found, np.ones(len(found)))
 
 
-def after(monitor: InnovationMonitor, ticks: int, squares: dict[int, float]) -> tuple[Finding, ...]:
+def after(
+    monitor: InnovationMonitor,
+    ticks: int,
+    squares: dict[int, float],
+    ranges: dict[tuple[int, int], float] | None = None,
+) -> tuple[Finding, ...]:
     for _ in range(ticks):
-        found = monitor.observe(residuals(squares))
+        found = monitor.observe(residuals(squares, ranges))
     return found
 
 
@@ -64,7 +69,7 @@ def test_a_receiver_that_stays_off_is_told_of_and_loses_its_weight(slot: int, gr
     assert finding.limit is not None
     assert finding.value > finding.limit
     # and its rows are to get no weight
-    assert np.flatnonzero(monitor.ignored).tolist() == [slot]
+    assert np.flatnonzero(monitor.ignored.receivers).tolist() == [slot]
     # and after ten seconds more the position is taken to be held by the others
     [finding] = after(monitor, 100, fixes)
     assert (finding.what, finding.gravity) == (What.FIXES_IGNORED, Gravity.DEGRADED)
@@ -78,6 +83,27 @@ def test_of_three_drones_nobody_can_tell_whose_receiver_is_wrong() -> None:
     [finding] = after(monitor, 300, {0: 9.0, 1: 1.0, 2: 1.0})
     assert finding.what is What.FIXES_CONTRADICT
     assert not monitor.ignored.any()
+
+
+def ignored_pairs(monitor: InnovationMonitor) -> list[list[int]]:
+    return np.argwhere(np.triu(monitor.ignored.pairs)).tolist()
+
+
+def test_ranges_that_stay_off_lose_their_weight_where_fixes_that_fit_hold_both_ends() -> None:
+    monitor, good = InnovationMonitor(3, 0, PERIOD_S), dict.fromkeys(range(3), 1.0)
+    assert after(monitor, 30, good, {(0, 1): 1.0, (2, 1): 9.0}) == ()
+    assert ignored_pairs(monitor) == [[1, 2]]
+    assert np.argwhere(monitor.averages().ignored_pairs).tolist() == [[1, 2], [2, 1]]
+    # and once they agree they count again
+    after(monitor, 100, good, {(0, 1): 1.0, (2, 1): 1.0})
+    assert ignored_pairs(monitor) == []
+
+
+@pytest.mark.parametrize("fixes", [{0: 1.0, 1: 1.0}, {0: 1.0, 1: 1.0, 2: 9.0}], ids=["no fixes", "fixes off as well"])
+def test_ranges_to_a_drone_that_no_fitting_fix_holds_keep_their_weight(fixes: dict[int, float]) -> None:
+    monitor = InnovationMonitor(3, 0, PERIOD_S)
+    after(monitor, 100, fixes, {(0, 1): 1.0, (1, 2): 8.0})
+    assert ignored_pairs(monitor) == []
 
 
 def test_averages_are_by_sensor_and_by_pair_and_unknown_where_nothing_came() -> None:
@@ -97,7 +123,7 @@ def test_what_is_known_stays_with_its_drone_when_the_fleet_changes() -> None:
     after(monitor, 100, dict.fromkeys(range(5), 1.0) | {3: 9.0})
     fresh = {6: (np.zeros(6), np.eye(6))}
     monitor.change_members(MemberChange.between(Layout((1, 2, 3, 4, 5)), (2, 3, 4, 5, 6), 2, fresh))
-    assert np.flatnonzero(monitor.ignored).tolist() == [2]
+    assert np.flatnonzero(monitor.ignored.receivers).tolist() == [2]
     told = monitor.averages().squares[:, Kind.POSITION]
     assert told[[0, 2]] == pytest.approx([1.0, 9.0], abs=0.4)
     assert np.isnan(told[4])

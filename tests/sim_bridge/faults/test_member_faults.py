@@ -42,17 +42,17 @@ STUCK = MemberStuck(agents=(2,), from_s=FROM_S, to_s=TO_S)
 
 
 class Member:
-    """Drone 2 with faults, and a neighbour that opens what it seals."""
+    """Drone 2 with faults, and neighbours that open what it seals, each message by one that has heard no other."""
 
     def __init__(self, *faults: MemberWrong | MemberStuck) -> None:
         self.sealer = CorruptSealer("test", 2, Identity(KEYS[2], TRUST, 5), faults, START_UNIX_S)
-        self.opener = Opener("test", ROSTER, TRUST, own_id=1)
 
     def said(self, message: Message, time_s: float) -> Message:
         """What the neighbour takes out of the packets of a message at a time since the start."""
         t_ns = round((START_UNIX_S + time_s) * 1e9)
+        opener = Opener("test", ROSTER, TRUST, own_id=1)
         heard = [
-            self.opener.open(key_expression("test", 2, packet.stream), packet.data, now=time_s, unix_ns=t_ns)
+            opener.open(key_expression("test", 2, packet.stream), packet.data, now=time_s, unix_ns=t_ns)
             for packet in self.sealer.seal(message, t_ns=t_ns, double=True)
         ]
         assert heard[-1] is not None  # signature, numbering and content are good
@@ -172,13 +172,17 @@ class Flight:
         self.estimates[agent.agent_id, ready.estimate.tick] = ready
 
 
-@pytest.mark.parametrize("fault", ['kind="member_wrong", offset_m=[3.0, 4.0, 0.0]', 'kind="member_stuck"'])
-def test_a_fleet_takes_the_signed_lies_of_a_member_from_their_first_tick_on(fault):
+@pytest.mark.parametrize(
+    ("fault", "reasons"),
+    [('kind="member_wrong", offset_m=[3.0, 4.0, 0.0]', set()), ('kind="member_stuck"', {"rejected repeated"})],
+    ids=["liar", "zombie"],
+)
+def test_a_fleet_takes_the_signed_words_of_a_member_from_its_first_tick_on(fault, reasons):
     # GIVEN one flight with a fault of a member from 2.5 s on, and the same without
     clean, lied = Flight(), Flight(f"sim.faults=[{{{fault}, agents=[2], from_s=2.5}}]")
-    # THEN no packet is refused
-    for counters in lied.report.counters.values():
-        assert not [name for name in counters if name.startswith("rejected")]
+    # THEN its neighbours refuse what it repeats, and nothing else
+    for agent_id in (1, 3):
+        assert {name for name in lied.report.counters[agent_id] if name.startswith("rejected")} == reasons
     # and up to the fault the flights are equal, after it the neighbours estimate something else
     first = min(tick for _, tick in clean.estimates)
     begin = first + round(2.5 / PERIOD_S)

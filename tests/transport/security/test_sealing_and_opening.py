@@ -317,6 +317,34 @@ def test_clocks_too_far_apart(skew_s: float, accepted: bool) -> None:
     assert receiver.refused == ([] if accepted else [Reason.STALE])
 
 
+def said(tick: int, speed_mps: float) -> list[Message]:
+    """What a drone says in a tick: measurements and information."""
+    records = (SpeedMeasurement(2, tick, speed_mps, 0.25), RangeMeasurement(2, tick, 3, 5.0, 0.25))
+    vector = np.full(18, speed_mps)
+    return [Measurements(tick, records), Information(tick, 0, tick - 1, 6, (1, 2, 3), np.eye(18), vector)]
+
+
+def test_a_member_that_repeats_itself_is_refused_until_it_says_something_new() -> None:
+    # GIVEN a member with a good key that says the same of five ticks, with new numbers and stamps, then something new
+    receiver, sender = Receiver(), sealer()
+    opened = []
+    for tick, speed_mps in enumerate([1.0, 2.0, 3.0, 3.0, 3.0, 3.0, 3.0, 4.0], start=9):
+        packets = [packet for message in said(tick, speed_mps) for packet in sender.seal(message, t_ns=T_NS)]
+        opened.append([receiver.open(packet) is not None for packet in packets])
+    # THEN what comes for the third time is refused, and what is new is not
+    assert opened == [[True, True]] * 4 + [[False, False]] * 3 + [[True, True]]
+    assert receiver.refused == [Reason.REPEATED] * 6
+
+
+def test_a_member_without_anything_to_say_may_repeat_it() -> None:
+    receiver, sender = Receiver(), sealer()
+    for tick in range(9, 30):
+        (packet,) = sender.seal(Measurements(tick, (SpeedMeasurement(2, tick, 1.0, 0.25),)), t_ns=T_NS)
+        assert receiver.open(packet) is not None
+        (packet,) = sender.seal(Measurements(tick, (), 1), t_ns=T_NS)
+        assert receiver.open(packet) is not None
+
+
 def test_a_properly_signed_bad_body_is_refused() -> None:
     # GIVEN a member that signs garbage: the signature is good, the numbers are not
     receiver, packet = Receiver(), sealed()

@@ -109,7 +109,7 @@ class SensorsTable(Table, frozen=True):
     """Of the speed; absent = the receiver's own accuracy and no hard bound."""
     gps_variance_factor: Annotated[float, msgspec.Meta(ge=1)] = 1.0
     """On the receiver's own position variance. Its error wanders over a minute; an estimator that takes ten fixes
-    a second for independent (`systematic_errors` off) soon trusts their mean too much, unless each counts for less."""
+    a second for independent (no `systematic_errors`) soon trusts their mean too much, unless each counts for less."""
     gps_min_fix: Annotated[int, msgspec.Meta(ge=2, le=8)] = 3
     """Least fix type (GPS_FIX_TYPE) of a fix that is used: 3 = 3-D, 4 = DGPS, 5 = RTK float, 6 = RTK fixed."""
     geoid_separation_m: float | None = None

@@ -43,12 +43,15 @@ from estimators.estimator import Estimate
 from estimators.integrity.finding import Finding
 from estimators.integrity.solution import Solution
 from estimators.integrity.staleness import Ages, gps_lost
+from estimators.integrity.thresholds import GPS_LOST_S
 from estimators.model.layout import Layout, block
 from transport.link.rounds import RoundBarrier
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurement, Measurements
 from transport.security.opening import Received
 
+FIX_SHARE = 0.1
+"""Of an interval between fixes in their average."""
 USUAL_EXCHANGES = 2
 """Packets of records in every tick; more of `transport.exchanges` only where records of earlier ticks are lacked."""
 MAX_BEHIND_TICKS = 50
@@ -91,6 +94,8 @@ class AgentCore:
         self._barrier: RoundBarrier[Information] = RoundBarrier(max(config.estimator.rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
+        self._fix_interval_s: float | None = None
+        """Between own fixes, on average."""
         self._tick: int | None = None
         self._phase = _Phase.END
         self._end_s = self._close_s = self._packets_by_s = -math.inf
@@ -125,7 +130,7 @@ class AgentCore:
         """A fix."""
         if not self._plausible("gps", sample.t_s, now_s):
             return
-        self._last_fix_s = now_s
+        self._note_fix(now_s)
         corrected = self.gps_latency.on_fix(sample)
         for record in gps_measurements(self._agent_id, corrected, self._period_s, self._config.sensors):
             self._on_own_record(record)
@@ -183,6 +188,14 @@ class AgentCore:
         outcome = self._barrier.put(sender, message.tick, message.round, message)
         self.counters[f"information: {outcome.name.lower()}"] += 1
         self.neighbours.on_information(sender, now_s)
+
+    def _note_fix(self, now_s: float) -> None:
+        """Note that a fix came in; a gap of the receiver is no interval between fixes."""
+        if self._last_fix_s is not None and now_s - self._last_fix_s <= GPS_LOST_S:
+            known = self._fix_interval_s
+            found = now_s - self._last_fix_s
+            self._fix_interval_s = found if known is None else known + FIX_SHARE * (found - known)
+        self._last_fix_s = now_s
 
     def gps_age_s(self, now_s: float) -> float | None:
         """Time since the last own fix came in; ``None`` before the first."""
@@ -368,7 +381,7 @@ class AgentCore:
         """What the monitors look at when an estimate of those who are present is out."""
         assert self._tick is not None
         started, fix_age_s, roll = self.fleet.started, self.gps_age_s(now_s), self.fleet.roll
-        alone = started and gps_lost(fix_age_s)  # nothing but ranges can hold the position
+        alone = started and gps_lost(fix_age_s, self._fix_interval_s)  # nothing but ranges can hold the position
         return TickEvidence(
             Solution(
                 status=estimate.status if started else None,
@@ -380,6 +393,7 @@ class AgentCore:
                 imu_coverage=0.0 if self._input is None else self._input.coverage,
                 aided=self._input is None or self._input.aided,
                 heard_age_s=self.neighbours.expected_ages_s(now_s),
+                fix_interval_s=self._fix_interval_s,
             ),
             autopilot=self._link_state,
             geometry=roll.geometry(self._agent_id, self._tick) if alone else None,

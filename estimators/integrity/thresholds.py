@@ -7,6 +7,10 @@ Lengths in m, times in s or ticks of the fleet, sigmas are 1-sigma, nats are dif
 
 GPS_LOST_S = 1.5
 """Without a fix for so long a drone has to do without GPS: receivers give one a second or more, and may be late."""
+GPS_LOST_FIXES = 4.0
+"""Where fixes come faster, so many of them that do not come are enough."""
+GPS_LOST_LEAST_S = 0.7
+"""But none is missed earlier: links are late by that much."""
 MIN_IMU_COVERAGE = 0.9
 """Share of a tick that IMU samples vouch for; of the rest, a tick of 0.1 s at the usual rates loses one sample."""
 FIX_MEMORY_TICKS = 30

@@ -26,6 +26,16 @@ def test_without_a_fix_of_late_there_is_no_gps(age_s: float | None) -> None:
     assert observe(Ages(age_s, 1.0)) == (Finding(What.NO_FIX, Gravity.DEGRADED, value=age_s, limit=GPS_LOST_S),)
 
 
+@pytest.mark.parametrize(
+    ("interval_s", "limit_s"),
+    [(0.05, 0.7), (0.1, 0.7), (0.2, 0.8), (0.3, 1.2), (1.0, GPS_LOST_S), (None, GPS_LOST_S)],
+)
+def test_where_fixes_come_often_they_are_missed_earlier(interval_s: float | None, limit_s: float) -> None:
+    assert observe(Ages(0.99 * limit_s, 1.0, fix_interval_s=interval_s)) == ()
+    (finding,) = observe(Ages(1.01 * limit_s, 1.0, fix_interval_s=interval_s))
+    assert (finding.what, finding.limit) == (What.NO_FIX, pytest.approx(limit_s))
+
+
 def test_a_gap_of_the_imu_is_found_by_its_share_of_the_tick() -> None:
     assert observe(Ages(0.1, 0.89)) == (Finding(What.IMU_GAP, Gravity.DEGRADED, value=0.89, limit=MIN_IMU_COVERAGE),)
 

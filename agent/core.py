@@ -30,6 +30,7 @@ from agent.config.tables import FleetConfig
 from agent.fleet.far_field import FarField
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.measurements import acceleration_measurement, gps_measurements, range_measurement
+from agent.fleet.neighbourhood import rounds_of
 from agent.fleet.neighbours import NeighbourTable
 from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
@@ -91,7 +92,8 @@ class AgentCore:
         self.far_field = FarField(config, agent_id, self.counters)
         self._link_state = ""
         """Of the autopilot, for the health; told with every `advance`."""
-        self._barrier: RoundBarrier[Information] = RoundBarrier(max(config.estimator.rounds, 1))
+        self._rounds = rounds_of(config)
+        self._barrier: RoundBarrier[Information] = RoundBarrier(max(self._rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
         self._tick: int | None = None
@@ -313,7 +315,7 @@ class AgentCore:
 
     def _open_round_or_solve(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
-        rounds = self._config.estimator.rounds
+        rounds = self._rounds
         if self._round >= rounds:
             self._finish(self.fleet.solve(), now_s, outputs)
             return

@@ -13,6 +13,8 @@ NEAR_HOPS = 2
 RELAYS_TIMES = 1
 """So often a record of somebody else is relayed in such a fleet: most come by several neighbours, and a packet holds
 little more than one tick's of them."""
+MOST_ROUNDS = 1
+"""Consensus rounds of a tick in such a fleet, at most: a second one took as much and changed no error, with loss or without."""
 LINK_MEMORY_S = 5.0
 """A link of which nothing was heard or measured for longer is none."""
 
@@ -20,6 +22,12 @@ LINK_MEMORY_S = 5.0
 def is_limited(config: FleetConfig) -> bool:
     """Whether the fleet is larger than a drone's joint state may be."""
     return len(config.ids) > config.fleet.joint_bodies
+
+
+def rounds_of(config: FleetConfig) -> int:
+    """Consensus rounds of a tick."""
+    rounds = config.estimator.rounds
+    return min(rounds, MOST_ROUNDS) if is_limited(config) else rounds
 
 
 class Neighbourhood:

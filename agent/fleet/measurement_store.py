@@ -110,7 +110,7 @@ class MeasurementStore:
         for record in records:
             kept = self._kept_of(record)
             if self._wanted(record, tick):
-                if self._echoes_back(record, sender, kept):
+                if self._echoes_back(record, sender):
                     self._echoes[record.identity] = record
                 if kept is None:
                     kept = self._add(record)
@@ -239,14 +239,12 @@ class MeasurementStore:
             return False
         return True
 
-    def _echoes_back(self, record: Measurement, sender: int, kept: _Kept | None) -> bool:
-        """Whether a record is said back, so that neighbours know that it is here; ``kept`` if it was here before.
+    def _echoes_back(self, record: Measurement, sender: int) -> bool:
+        """Whether a record is said back, so that neighbours know that it is here.
 
-        Where relayed records are counted only owners repeat theirs: they are told, unless our relaying tells them.
+        Where relayed records are counted only owners repeat theirs, so only they are told.
         """
-        if self.neighbourhood.relays_times is None:
-            return True
-        return sender == record.observer and (kept is not None or not self.neighbourhood.sends(record))
+        return self.neighbourhood.relays_times is None or sender == record.observer
 
     def _kept_of(self, record: Measurement) -> _Kept | None:
         """What is kept of a record, if it was taken in."""

@@ -14,7 +14,7 @@ RELAYS_TIMES = 1
 """So often a record of somebody else is relayed in such a fleet: most come by several neighbours, and a packet holds
 little more than one tick's of them."""
 MOST_ROUNDS = 1
-"""Consensus rounds of a tick in such a fleet, at most: a second one took as much and changed no error, with loss or without."""
+"""Consensus rounds of a tick in such a fleet, at most: a second one changed no error, with loss or without."""
 LINK_MEMORY_S = 5.0
 """A link of which nothing was heard or measured for longer is none."""
 
@@ -95,7 +95,7 @@ class Neighbourhood:
             found |= {other for other, when in self._heard.items() if when >= oldest}
         elif self._heard.get(agent_id, -1) >= oldest:
             found.add(self._agent_id)
-        return found
+        return found - {agent_id}
 
     def uses(self, record: Measurement) -> bool:
         """Whether this agent's estimator takes the record."""

@@ -339,7 +339,7 @@ class AgentCore:
         whole = in_layout(estimate, present, self.layout)
         if self.far_field.is_on:
             whole = self.far_field.added_to(whole, present, self.layout)
-        ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time)
+        ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time, present)
         message = estimate_message(estimate, present, own)
         changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)
         if self.fleet.started:

@@ -6,6 +6,7 @@ agent alone. In the flight all agents share one process, and with it what it rem
 
 from __future__ import annotations
 
+import gc
 import math
 import time
 from collections import Counter
@@ -242,9 +243,13 @@ def fly(flight: Flight) -> Flown:
     lockstep.queue.at(settled_s, traffic.bytes.clear)
     report = lockstep.run(flight.duration_s)
     seconds = (flight.duration_s - flight.settle_s) * flight.size
+    del lockstep
+    gc.collect()
+    gc.freeze()  # a daemon's process holds one agent: collections are not to look at the flight's hundred
     times = [
         _timed(OnboardAgent(config, i, *made[i][0], **made[i][1]), agents[i].calls, settled_s) for i in sorted(agents)
     ]
+    gc.unfreeze()
     per_tick = config.fleet.period_s / (flight.duration_s - flight.settle_s)
     from_unix_s = report.start_unix_s + flight.settle_s
     return Flown(

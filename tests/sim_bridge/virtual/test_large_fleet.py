@@ -1,4 +1,4 @@
-"""A fleet larger than a joint state, in virtual time: everybody is shown, what is far with its age, nothing goes far."""
+"""A fleet larger than a joint state: everybody is shown, what is far with its age, and nothing goes too far."""
 
 from __future__ import annotations
 

@@ -107,7 +107,7 @@ class FarField:
             age = max(estimate.tick - report.tick, 0)
             if agent in members or agent == self._agent_id or age > self._keep_ticks:
                 continue
-            mean, variance = self._moved_on(report, age)
+            mean, variance = moved_on(report, age * self._period_s, self._accel_variance)
             slot = layout.slot(agent)
             at = states_of([slot])
             estimate.mean[block(slot)] = mean
@@ -119,13 +119,15 @@ class FarField:
         self._newest[report.agent] = report
         self._waiting.setdefault(report.agent)
 
-    def _moved_on(self, report: FarReport, age_ticks: int) -> tuple[Vector, Vector]:
-        """Mean and variance ``(6,)`` of a drone so many ticks after its report, had it flown straight on."""
-        age_s = age_ticks * self._period_s
-        mean = np.array((*report.position_m, *report.velocity_mps))
-        mean[:3] += age_s * mean[3:]
-        variance = np.square((*report.position_sigma_m, *report.velocity_sigma_mps))
-        variance[:3] += age_s**2 * variance[3:]
-        half = STATES_PER_AGENT // 2
-        variance += np.repeat(drift_variances(age_s, self._accel_variance), half)
-        return mean, variance
+
+def moved_on(report: FarReport, age_s: float, accel_variance: float) -> tuple[Vector, Vector]:
+    """Mean and variance ``(6,)`` of a drone a time after its report, had it flown straight on.
+
+    ``accel_variance``, (m/s2)2 per axis, is of an acceleration that is not known and lasts.
+    """
+    mean = np.array((*report.position_m, *report.velocity_mps))
+    mean[:3] += age_s * mean[3:]
+    variance = np.square((*report.position_sigma_m, *report.velocity_sigma_mps))
+    variance[:3] += age_s**2 * variance[3:]
+    variance += np.repeat(drift_variances(age_s, accel_variance), STATES_PER_AGENT // 2)
+    return mean, variance

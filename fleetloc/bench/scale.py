@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import typer
 
-from fleetloc.bench.scale_flights import FAR, NEAR, Flight, Flown, fly
+from fleetloc.bench.scale_flights import FAR, NEAR, ScaleFlight, ScaleFlown, fly
 from fleetloc.output import print_table, progress_bar
 from sim_bridge.studies.monte_carlo import Hangar
 
@@ -28,11 +28,11 @@ def scale(
     plans = [(size, joint_bodies) for size in sizes] + [(size, max(size, 2)) for size in whole]
     plans = list(dict.fromkeys(plans))
     flights = [
-        Flight(size, each, joint, duration_s, settle_s, degree, timed)
+        ScaleFlight(size, each, joint, duration_s, settle_s, degree, timed)
         for size, joint in plans
         for each in range(seed, seed + runs)
     ]
-    flown: list[Flown] = []
+    flown: list[ScaleFlown] = []
     with Hangar(min(jobs, len(flights))) as hangar, progress_bar("flights", len(flights)) as advance:
         for one in hangar.map(fly, flights):
             flown.append(one)
@@ -50,7 +50,7 @@ def scale(
     return results
 
 
-def _figures(size: int, joint: int, flown: Sequence[Flown]) -> Figures:
+def _figures(size: int, joint: int, flown: Sequence[ScaleFlown]) -> Figures:
     """The figures of a size, over its seeds; units are in the names, what is not known is NaN."""
     cpu_s = np.concatenate([one.cpu_s for one in flown])
     step_s = np.concatenate([one.step_s for one in flown])

@@ -44,7 +44,7 @@ NEAR, FAR = "near", "far"
 
 
 @dataclass(frozen=True, slots=True)
-class Flight:
+class ScaleFlight:
     """A flight to be flown: ``size`` drones on a graph drawn from ``seed``, joint states of ``joint_bodies`` at most.
 
     Figures are of what is after ``settle_s``; of ``timed`` agents the computing time is measured.
@@ -60,7 +60,7 @@ class Flight:
 
 
 @dataclass(frozen=True, slots=True)
-class Flown:
+class ScaleFlown:
     """What came of it.
 
     Attributes
@@ -123,7 +123,7 @@ def _is_connected(size: int, edges: list[tuple[int, int]]) -> bool:
     return len(reached) == size
 
 
-def configured(flight: Flight) -> FleetConfig:
+def configured(flight: ScaleFlight) -> FleetConfig:
     """The configuration of a flight: the paper's noise, everybody with GPS, on a circle about its place."""
     places, edges = places_and_edges(flight.size, flight.degree, flight.seed)
     ids = range(1, flight.size + 1)
@@ -200,7 +200,7 @@ class _Traffic:
 
 
 @dataclass(frozen=True, slots=True)
-class _Note:
+class _Said:
     """What a drone said of a tick: of itself, and now and then of those beyond its joint state."""
 
     slot: int
@@ -217,12 +217,12 @@ FAR_EVERY_TICKS = 10
 """So often is put down what is told of those beyond."""
 
 
-def fly(flight: Flight) -> Flown:
+def fly(flight: ScaleFlight) -> ScaleFlown:
     """Fly it; the same flight gives the same figures but for times."""
     config = configured(flight)
     timed = _typical(config, flight)
     agents: dict[int, _Listening] = {}
-    notes: list[_Note] = []
+    notes: list[_Said] = []
 
     def make_agent(config: FleetConfig, agent_id: int, *args: Any, **kwargs: Any) -> OnboardAgent:
         if agent_id not in timed:
@@ -252,7 +252,7 @@ def fly(flight: Flight) -> Flown:
     gc.unfreeze()
     per_tick = config.fleet.period_s / (flight.duration_s - flight.settle_s)
     from_unix_s = report.start_unix_s + flight.settle_s
-    return Flown(
+    return ScaleFlown(
         degree=2 * len(config.fleet.edges or ()) / flight.size,
         cpu_s=per_tick * np.array([whole for whole, _ in times]),
         step_s=per_tick * np.array([step for _, step in times]),
@@ -262,7 +262,7 @@ def fly(flight: Flight) -> Flown:
     )
 
 
-def _typical(config: FleetConfig, flight: Flight) -> frozenset[int]:
+def _typical(config: FleetConfig, flight: ScaleFlight) -> frozenset[int]:
     """The agents that are timed: those whose number of neighbours is nearest to the mean."""
     mean = 2 * len(config.fleet.edges or ()) / flight.size
     by_degree = sorted(config.ids, key=lambda agent: abs(len(config.neighbours(agent)) - mean))
@@ -286,7 +286,7 @@ def _timed(agent: OnboardAgent, calls: list[Call], settled_s: float) -> tuple[fl
     return 1e-9 * (time.thread_time_ns() - began_ns), 1e-9 * step_ns
 
 
-def _note(config: FleetConfig, agent: OnboardAgent, ready: EstimateReady) -> _Note:
+def _note(config: FleetConfig, agent: OnboardAgent, ready: EstimateReady) -> _Said:
     estimate, present = ready.estimate, agent.core.fleet.present
     slot = config.ids.index(agent.agent_id)
     states = estimate.mean.reshape(-1, STATES_PER_AGENT)
@@ -301,7 +301,7 @@ def _note(config: FleetConfig, agent: OnboardAgent, ready: EstimateReady) -> _No
         variances = estimate.covariance.diagonal().reshape(-1, STATES_PER_AGENT)[slots, :3]
         age_s = np.asarray(estimate.age_ticks[slots] * config.fleet.period_s, np.float64)
         far = np.asarray(slots, np.int64), states[slots, :3].copy(), variances.copy(), age_s
-    return _Note(
+    return _Said(
         slot,
         ready.t_s + config.fleet.epoch_unix_s,
         states[slot, :3].copy(),
@@ -312,7 +312,7 @@ def _note(config: FleetConfig, agent: OnboardAgent, ready: EstimateReady) -> _No
     )
 
 
-def _errors(notes: list[_Note], truth: Truth) -> dict[str, Any]:
+def _errors(notes: list[_Said], truth: Truth) -> dict[str, Any]:
     """The figures of what was said that are no costs."""
     notes = [note for note in notes if note.unix_s <= truth.time_unix_s[-1]]
     places = truth.at(np.array([note.unix_s for note in notes]))[:, :, :3]

@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from fleetloc import cli
-from fleetloc.bench.scale_flights import Flight, fly, places_and_edges
+from fleetloc.bench.scale_flights import ScaleFlight, fly, places_and_edges
 
-SHORT = Flight(size=7, seed=2, joint_bodies=4, duration_s=5.0, settle_s=3.0, degree=3.0, timed=2)
+SHORT = ScaleFlight(size=7, seed=2, joint_bodies=4, duration_s=5.0, settle_s=3.0, degree=3.0, timed=2)
 
 
 @pytest.mark.parametrize(("size", "degree"), [(10, 6.0), (40, 6.0), (5, 9.0)])

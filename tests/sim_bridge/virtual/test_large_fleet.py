@@ -15,7 +15,7 @@ from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate
 from estimators.factory import make_estimator
-from fleetloc.bench.scale_flights import Flight, configured
+from fleetloc.bench.scale_flights import ScaleFlight, configured
 from sim_bridge.virtual.fleet_events import FleetEvents
 from sim_bridge.virtual.fleet_lockstep import FleetLockstep, Surroundings
 from sim_bridge.world.scenario import Interval
@@ -50,7 +50,7 @@ class Flown:
 
 @pytest.fixture(scope="module")
 def flown() -> Flown:
-    config = configured(Flight(SIZE, SEED, JOINT, FLIGHT_S, 0.0, 3.0, 1))
+    config = configured(ScaleFlight(SIZE, SEED, JOINT, FLIGHT_S, 0.0, 3.0, 1))
     fleet = msgspec.structs.replace(config.fleet, absent_after_s=ABSENT_AFTER_S)
     config = msgspec.structs.replace(config, fleet=fleet)
     run, said = Flown(config), []

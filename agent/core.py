@@ -27,8 +27,10 @@ from enum import Enum, auto
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.far_field import FarField
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.measurements import acceleration_measurement, gps_measurements, range_measurement
+from agent.fleet.neighbourhood import rounds_of
 from agent.fleet.neighbours import NeighbourTable
 from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
@@ -46,6 +48,7 @@ from estimators.integrity.staleness import Ages, gps_lost
 from estimators.integrity.thresholds import GPS_LOST_S
 from estimators.model.layout import Layout, block
 from transport.link.rounds import RoundBarrier
+from transport.messages.far_body import FarReports
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurement, Measurements
 from transport.security.opening import Received
@@ -89,9 +92,11 @@ class AgentCore:
         self.health = HealthMonitor()
         self.counters: Counter[str] = Counter()
         self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters)
+        self.far_field = FarField(config, agent_id, self.counters)
         self._link_state = ""
         """Of the autopilot, for the health; told with every `advance`."""
-        self._barrier: RoundBarrier[Information] = RoundBarrier(max(config.estimator.rounds, 1))
+        self._rounds = rounds_of(config)
+        self._barrier: RoundBarrier[Information] = RoundBarrier(max(self._rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
         self._fix_interval_s: float | None = None
@@ -155,6 +160,9 @@ class AgentCore:
             self._on_measurements(received.sender, message)
         elif isinstance(message, Information):
             self._on_information(received.sender, message, now_s)
+        elif isinstance(message, FarReports):
+            assert self._tick is not None
+            self.far_field.hear(message.reports, self._tick)
 
     def on_gone(self, agent_id: int) -> None:
         """A neighbour has left (liveliness): nothing is expected of it until it is heard again."""
@@ -320,7 +328,7 @@ class AgentCore:
 
     def _open_round_or_solve(self, now_s: float, outputs: list[CoreOutput]) -> None:
         assert self._tick is not None
-        rounds = self._config.estimator.rounds
+        rounds = self._rounds
         if self._round >= rounds:
             self._finish(self.fleet.solve(), now_s, outputs)
             return
@@ -341,10 +349,18 @@ class AgentCore:
         on_time = now_s <= self._end_s + self._period_s
         present = self.fleet.present
         own = block(present.index(self._agent_id))
-        ready = EstimateReady(in_layout(estimate, present, self.layout), self._tick * self._period_s, now_s, on_time)
+        whole = in_layout(estimate, present, self.layout)
+        if self.far_field.is_on:
+            whole = self.far_field.added_to(whole, present, self.layout)
+        ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time, present)
         message = estimate_message(estimate, present, own)
         changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)
+        if self.fleet.started:
+            self.far_field.note_own(estimate, own)
+        reports = self.far_field.packet(self._tick)
         outputs += (ready, Tell(message))  # nothing fails from here on: no tick has two estimates
+        if reports is not None:
+            outputs.append(Tell(reports))
         if changed is not None:
             outputs.append(HealthChanged(changed))
         self.counters["ticks"] += 1

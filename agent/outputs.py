@@ -45,13 +45,15 @@ class LinkChanged:
 class EstimateReady:
     """The estimate of a tick, at fleet time ``t_s``, finished by ``ready_s``.
 
-    ``on_time``: within one period of the tick's end.
+    ``on_time``: within one period of the tick's end. ``joint``: ids of those who were estimated together; the others'
+    blocks are what they report of themselves, or nothing, independent of all. Absent: not known.
     """
 
     estimate: Estimate
     t_s: float
     ready_s: float
     on_time: bool
+    joint: tuple[int, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True)

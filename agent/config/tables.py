@@ -17,6 +17,9 @@ from agent.radio.radio_faults import FaultsTable
 from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
 from estimators.settings import EstimatorSettings, default_settings
 
+JOINT_BODIES = 10
+"""Default of `fleet.joint_bodies`."""
+
 
 class OriginTable(Table, frozen=True):
     """Geodetic origin of the fleet's NED frame."""
@@ -47,6 +50,9 @@ class FleetTable(Table, frozen=True):
     """
     edges: tuple[tuple[AgentId, AgentId], ...] | None = None
     """Who may hear and range whom, both ways; absent = neighbours are all who are heard."""
+    joint_bodies: Annotated[int, msgspec.Meta(ge=2, le=999)] = JOINT_BODIES
+    """Most drones of one joint state. In a larger fleet a drone estimates itself and its nearest neighbours, by hops;
+    of those beyond it has what they report of themselves, once a second, with its age."""
     absent_after_s: Annotated[float, msgspec.Meta(ge=1, le=3600)] = 10.0
     """A drone of which nothing was heard or measured for longer is let go; it comes back when it is located again."""
 

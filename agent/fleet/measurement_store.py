@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import math
 from collections import Counter, deque
 from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
 from agent.fleet.measurements import inputs_of, rows_of
+from agent.fleet.neighbourhood import Neighbourhood
 from estimators.model.measurements import InputTable, RowTable
 from transport.errors import EncodeError
+from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
     Measurement,
@@ -26,64 +27,20 @@ AHEAD_TICKS = 2
 """Records of a neighbour whose clock is ahead by more are refused."""
 
 
-class Neighbourhood:
-    """Who is how many hops away, and what that means for records.
-
-    With configured edges the hops are those of the graph. Without, neighbours are who is heard: one hop for a drone
-    that was heard directly of late, two for all others (a record does not say how far it came).
-    """
-
-    def __init__(self, config: FleetConfig, agent_id: int) -> None:
-        settings, size = config.estimator, len(config.ids)
-        self._rows_from, self._rows_to = 1 + settings.relay_hops, settings.relay_hops
-        """Hops from which rows are used, and from which they are sent on; the same of inputs."""
-        self._inputs_from = {"none": 0, "neighbours": 1, "fleet": size}[settings.share_inputs]
-        self._inputs_to = {"none": -1, "neighbours": 0, "fleet": size}[settings.share_inputs]
-        self._recent_ticks = math.ceil(config.transport.neighbour_timeout_s / config.fleet.period_s)
-        self._heard: dict[int, int] = {}
-        self._tick = 0
-        self._graph = {agent_id: 0}
-        """Hops along the configured edges to each agent that can be reached."""
-        self._by_reach = config.fleet.edges is None
-        self._agent_id = agent_id
-        frontier, distance = [agent_id], 0
-        while frontier:
-            distance += 1
-            reached = dict.fromkeys(n for one in frontier for n in config.neighbours(one))
-            frontier = [n for n in reached if n not in self._graph]
-            self._graph |= dict.fromkeys(frontier, distance)
-
-    def hear(self, agent_id: int, tick: int) -> None:
-        """A packet came directly from an agent."""
-        self._heard[agent_id] = tick
-        self._tick = max(self._tick, tick)
-
-    def hops(self, agent_id: int) -> int | None:
-        """Hops to an agent; ``None`` if no edges lead there."""
-        if not self._by_reach or agent_id == self._agent_id:
-            return self._graph.get(agent_id)
-        heard = self._heard.get(agent_id)
-        return 1 if heard is not None and self._tick - heard <= self._recent_ticks else 2
-
-    def uses(self, record: Measurement) -> bool:
-        """Whether this agent's estimator takes the record."""
-        hops = self.hops(record.observer)
-        limit = self._inputs_from if isinstance(record, AccelerationMeasurement) else self._rows_from
-        return hops is not None and hops <= limit
-
-    def sends(self, record: Measurement) -> bool:
-        """Whether this agent tells its neighbours: its own records, and others' that are relayed so far."""
-        hops = self.hops(record.observer)
-        limit = self._inputs_to if isinstance(record, AccelerationMeasurement) else self._rows_to
-        return hops is not None and hops <= limit
-
-
 @dataclass(slots=True)
 class _Kept:
     """A record that was taken in; ``held_by`` are neighbours known to have it: it was in their packets."""
 
     record: Measurement
     held_by: set[int] = field(default_factory=set)
+    sent: int = 0
+    """Packets that carried it, counted where that is limited."""
+    most: int | None = None
+    """After so many it is sent no more; ``None``: never mind how many."""
+
+    def is_done(self, neighbours: frozenset[int]) -> bool:
+        """Whether all ``neighbours`` are known to have it, or it was sent as often as it is to be."""
+        return self.held_by >= neighbours or (self.most is not None and self.sent >= self.most)
 
 
 @dataclass(slots=True)
@@ -105,7 +62,7 @@ class _OnItsWay:
         if neighbours <= self._held_by:
             return True
         for kept in (*self.own, *self.relayed):
-            if not kept.held_by >= neighbours:
+            if not kept.is_done(neighbours):
                 return False
         self._held_by = neighbours
         return True
@@ -153,7 +110,8 @@ class MeasurementStore:
         for record in records:
             kept = self._kept_of(record)
             if self._wanted(record, tick):
-                self._echoes[record.identity] = record
+                if self._echoes_back(record, sender):
+                    self._echoes[record.identity] = record
                 if kept is None:
                     kept = self._add(record)
                     taken.append(record)
@@ -175,7 +133,7 @@ class MeasurementStore:
         inputs: list[AccelerationMeasurement] = []
         later: list[Measurement] = []
         for record in self._rows:
-            end = record.other if isinstance(record, RangeMeasurement) else record.observer
+            end = _far_end(record)
             ready = record.tick <= tick and record.observer in usable and end in usable
             (rows if ready else later).append(record)
         later_inputs: list[AccelerationMeasurement] = []
@@ -184,6 +142,13 @@ class MeasurementStore:
         self._rows, self._inputs = later, later_inputs
         self.forget(tick)
         return rows_of(rows, slots), inputs_of(inputs, slots)
+
+    def let_go_beyond(self, wanted: Container[int]) -> None:
+        """Let go what names somebody who is not wanted in the joint state: it would wait in vain."""
+        rows = [record for record in self._rows if record.observer in wanted and _far_end(record) in wanted]
+        inputs = [record for record in self._inputs if record.observer in wanted]
+        self.refused["beyond the joint state"] += len(self._rows) + len(self._inputs) - len(rows) - len(inputs)
+        self._rows, self._inputs = rows, inputs
 
     def forget(self, tick: int) -> None:
         """Let go what no window that ends at a tick or later could use."""
@@ -202,17 +167,45 @@ class MeasurementStore:
 
         While nobody is heard all of the last ticks goes out.
         """
-        lacked: dict[bytes, Measurement] = {}
+        if self.neighbourhood.relays_times is not None:
+            records = self._counted(tick, exchange, neighbours)
+        else:
+            records = {kept.record.identity: kept.record for kept in self._lacking(tick, neighbours)}
+            records.update((name, record) for name, record in self._newest_echoes() if name not in records)
+        self._echoes = {}
+        return Measurements(tick, tuple(records.values()), exchange)
+
+    def _lacking(self, tick: int, neighbours: frozenset[int]) -> Iterator[_Kept]:
+        """What some neighbour may lack, of the newest tick first."""
         for on_its_way in self._last_ticks(tick, tick):
             if neighbours and on_its_way.is_held_by(neighbours):
                 continue
             for kept in (*on_its_way.own, *on_its_way.relayed):
-                if not neighbours or not kept.held_by >= neighbours:
-                    lacked[kept.record.identity] = kept.record
-        echoes = sorted(self._echoes.items(), key=lambda item: -item[1].tick)
-        lacked.update((name, record) for name, record in echoes if name not in lacked)
-        self._echoes = {}
-        return Measurements(tick, tuple(lacked.values()), exchange)
+                if not neighbours or not kept.is_done(neighbours):
+                    yield kept
+
+    def _newest_echoes(self) -> list[tuple[bytes, Measurement]]:
+        return sorted(self._echoes.items(), key=lambda item: -item[1].tick)
+
+    def _counted(self, tick: int, exchange: int, neighbours: frozenset[int]) -> dict[bytes, Measurement]:
+        """The records of a packet where it is counted what goes out how often: new ones, echoes, repeated ones."""
+        lacking = [
+            kept
+            for kept in self._lacking(tick, neighbours)
+            if not (kept.sent and exchange == 1 and kept.record.tick == tick)  # nobody can have said it back yet
+        ]
+        new = {kept.record.identity: kept.record for kept in lacking if not kept.sent}
+        records = new | dict(self._newest_echoes())
+        records |= {kept.record.identity: kept.record for kept in lacking}
+        room_bytes, fitting = MAX_DATAGRAM_BODY_BYTES, set[bytes]()
+        for name, record in records.items():
+            room_bytes -= len(record.wire or b"")
+            if room_bytes < 0:
+                break
+            fitting.add(name)
+        for kept in lacking:
+            kept.sent += kept.record.identity in fitting
+        return {name: records[name] for name in records if name in fitting}
 
     def lacked(self, tick: int, neighbours: frozenset[int]) -> bool:
         """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get.
@@ -220,6 +213,9 @@ class MeasurementStore:
         Where links are slow no echo can be back yet of the last ticks' records: these are not asked for.
         """
         newest = tick - 1 - min(self._echoed_after, default=0)
+        if self.neighbourhood.relays_times is not None:  # only owners see to it that all have their records
+            own = (kept for on_its_way in self._last_ticks(newest, tick) for kept in on_its_way.own)
+            return not all(kept.is_done(neighbours) for kept in own)
         return not all(on_its_way.is_held_by(neighbours) for on_its_way in self._last_ticks(newest, tick))
 
     def _last_ticks(self, newest: int, tick: int) -> Iterator[_OnItsWay]:
@@ -243,6 +239,13 @@ class MeasurementStore:
             return False
         return True
 
+    def _echoes_back(self, record: Measurement, sender: int) -> bool:
+        """Whether a record is said back, so that neighbours know that it is here.
+
+        Where relayed records are counted only owners repeat theirs, so only they are told.
+        """
+        return self.neighbourhood.relays_times is None or sender == record.observer
+
     def _kept_of(self, record: Measurement) -> _Kept | None:
         """What is kept of a record, if it was taken in."""
         of_tick = self._kept.get(record.tick)
@@ -251,11 +254,19 @@ class MeasurementStore:
     def _add(self, record: Measurement) -> _Kept:
         """Take in a record that is not there yet."""
         kept = self._kept.setdefault(record.tick, {})[record.identity] = _Kept(record)
+        is_own = record.observer == self._agent_id
+        kept.most = None if is_own else self.neighbourhood.relays_times
+        self.neighbourhood.note(record)
         if self.neighbourhood.sends(record):
             on_its_way = self._to_send.setdefault(record.tick, _OnItsWay())
-            on_its_way.add(kept, is_own=record.observer == self._agent_id)
+            on_its_way.add(kept, is_own=is_own)
         if isinstance(record, AccelerationMeasurement):
             self._inputs.append(record)
         else:
             self._rows.append(record)
         return kept
+
+
+def _far_end(record: Measurement) -> int:
+    """The other agent of a range; of other records their own."""
+    return record.other if isinstance(record, RangeMeasurement) else record.observer

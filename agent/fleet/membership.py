@@ -69,6 +69,8 @@ class Membership:
         self._places: dict[int, Vector] = {}
         self.members: tuple[int, ...] = ()
         self.own_located = False
+        self.wanted: frozenset[int] | None = None
+        """Who may be a member; ``None``: everybody (`agent.fleet.joint_choice`)."""
 
     @property
     def located(self) -> tuple[int, ...]:
@@ -101,6 +103,8 @@ class Membership:
         """A neighbour's pair: what it knows well of drones that are not located here."""
         for agent in message.agents:
             if agent in self.located or (agent in self._heard and agent != self._agent_id):
+                continue
+            if not self.may_be_member(agent):
                 continue
             try:
                 information, vector = marginal_pair(
@@ -152,7 +156,7 @@ class Membership:
         found: dict[int, Prior] = {}
         usable = self.usable(tick)
         for agent in self._config.ids:
-            if agent not in usable:
+            if agent not in usable and self.may_be_member(agent):
                 prior = self._place(agent, tick, at_tick)
                 if prior is not None:
                     found[agent] = prior
@@ -160,8 +164,9 @@ class Membership:
         return found
 
     def gone(self, tick: int) -> tuple[int, ...]:
-        """Members of which nothing is known any more but what silence has left."""
-        return tuple(a for a in self.members if a != self._agent_id and self._is_gone(a, tick))
+        """Members of which nothing is known any more but what silence has left, and who are not wanted any more."""
+        others = (agent for agent in self.members if agent != self._agent_id)
+        return tuple(agent for agent in others if not self.may_be_member(agent) or self._is_gone(agent, tick))
 
     def enter(self, joined: Iterable[int], left: Collection[int], tick: int) -> None:
         """Change the members; the own drone is one of them from the first on."""
@@ -187,6 +192,10 @@ class Membership:
         ]
         places = np.array([place for place, _ in near]).reshape(-1, 3)
         return RangeGeometry.of(self._places[agent], places, np.array([age for _, age in near]))
+
+    def may_be_member(self, agent: int) -> bool:
+        """Whether an agent is wanted in the estimate."""
+        return self.wanted is None or agent in self.wanted
 
     def _place(self, agent: int, tick: int, at_tick: int) -> Prior | None:
         heard = tick - self._heard.get(agent, -math.inf) <= RANGED_TICKS

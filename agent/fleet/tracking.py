@@ -15,6 +15,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import POSITION_SIGMA_M, VELOCITY_SIGMA_MPS
+from agent.fleet.joint_choice import JointChoice
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
 from estimators.consensus.mapping import mapped_payload
@@ -70,6 +71,7 @@ class FleetTracker:
         self._good: _Good | None = None
         self._since_s: float | None = None
         self.roll = Membership(config, agent_id)
+        self._choice = JointChoice(config, agent_id)
         self.present: tuple[int, ...] = ()
         """Whom the latest estimate speaks of, in the order of its blocks."""
         self.innovations: Innovations | None = None
@@ -93,6 +95,9 @@ class FleetTracker:
 
     def begin(self, tick: int, now_s: float, records: MeasurementStore) -> bool:
         """Let the fleet change and open the tick; false while nobody is located."""
+        self.roll.wanted = self._choice.choose(tick, records.neighbourhood)
+        if self.roll.wanted is not None:
+            records.let_go_beyond(self.roll.wanted)
         if self._estimator is None:
             if not self._start(tick, now_s):
                 records.forget(tick)
@@ -212,7 +217,8 @@ class FleetTracker:
         if initial.position_m is not None:
             sigma = [POSITION_SIGMA_M] * 3 + [VELOCITY_SIGMA_MPS] * 3
             mean = np.array([*initial.position_m, 0.0, 0.0, 0.0])
-            return {agent: (mean, np.diag(np.square(sigma))) for agent in self._config.ids}
+            chosen = filter(self.roll.may_be_member, self._config.ids)
+            return {agent: (mean, np.diag(np.square(sigma))) for agent in chosen}
         found = self.roll.newcomers(tick, tick)
         waited = now_s - self._since_s >= MAX_WAIT_S
         return found if self._agent_id in found or waited else {}
@@ -266,7 +272,8 @@ def in_layout(estimate: Estimate, members: tuple[int, ...], layout: Layout) -> E
         return replace(estimate, age_ticks=told)
     at = states_of([layout.slot(agent) for agent in members])
     mean = np.zeros(layout.dimension)
-    covariance = ABSENT_VARIANCE * np.eye(layout.dimension)
+    covariance = np.zeros((layout.dimension, layout.dimension))
+    np.fill_diagonal(covariance, ABSENT_VARIANCE)
     ages = np.full(layout.size, MAX_AGE_TICKS)
     mean[at] = estimate.mean
     covariance[np.ix_(at, at)] = estimate.covariance

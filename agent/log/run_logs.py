@@ -10,7 +10,7 @@ from pathlib import Path
 from agent.config.reading import dump
 from agent.config.tables import FleetConfig
 from agent.log.disk import DiskLimit
-from agent.log.estimate_log import SUFFIX, EstimateLogHeader, EstimateLogWriter, write_summary
+from agent.log.estimate_log import SUFFIX, EstimateLogWriter, header_of, write_summary
 from agent.log.estimate_mcap import agent_key
 from agent.log.flight_format import FlightStart, trust_text
 from agent.log.flight_log import FlightLog
@@ -35,14 +35,8 @@ class RunLogs(Observer):
         settings = config.record
         self._epoch_unix_s = config.fleet.epoch_unix_s
         stem = directory / agent_key(agent_id)
-        header = EstimateLogHeader(
-            fleet=config.fleet.name,
-            agent=agent_id,
-            agents=config.ids,
-            period_s=config.fleet.period_s,
-            epoch_unix_s=config.fleet.epoch_unix_s,
-        )
-        self._estimates = EstimateLogWriter(stem.with_suffix(SUFFIX), header, int(ESTIMATES_MB * MB))
+        path = stem.with_suffix(SUFFIX)
+        self._estimates = EstimateLogWriter(path, header_of(config, agent_id), int(ESTIMATES_MB * MB))
         self.flight: FlightLog | None = None
         if settings.flight:
             limit = DiskLimit(directory, int(settings.flight_max_mb * MB))

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from agent.config.tables import FleetConfig
+from agent.fleet.neighbourhood import is_limited
 from agent.radio.radio_faults import channel_settings
 from agent.radio.security import agent_session, credentials, expiry_warnings, new_salt
 from transport.errors import Rejected, RejectionCounter
@@ -26,6 +27,7 @@ from transport.security.sealing import Packet
 
 LOG = logging.getLogger("fleetloc.agent")
 USED_STREAMS = (Stream.MEAS, Stream.INFO)
+"""What is listened to of every neighbour; in a fleet larger than a joint state also its far field."""
 REDECLARE_AFTER_S = 1.0
 """A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
 
@@ -92,7 +94,7 @@ class Radio:
         self._heard_s = dict.fromkeys(self._neighbours, time.monotonic())
         session.subscribe(self._agent_id, (Stream.UWB,))
         for neighbour in self._neighbours:
-            session.subscribe(neighbour, USED_STREAMS)
+            session.subscribe(neighbour, (*USED_STREAMS, Stream.FAR) if is_limited(self._config) else USED_STREAMS)
         session.announce()
         self._session = session
         self._repair_later()

@@ -3,14 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import lru_cache
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.estimator import Payload
-from estimators.model.gaussian import Pair, marginal_pair
+from estimators.model.gaussian import Pair, marginal_of_states, other_states
 from estimators.model.layout import STATES_PER_AGENT, states_of
 from estimators.model.measurements import Vector
 
+Places = NDArray[np.int64]
+PAIRS_OF_FLEETS = 128
+"""So many pairs of fleets are remembered: neighbours' fleets seldom change."""
 FLAT_INFORMATION = 1e-8
 """What stands for no information (1/m2, s2/m2) where a pair must stay definite: a sigma of 10 km."""
 
@@ -24,15 +29,23 @@ def mapped_pair(
     ``flat`` about ``centre`` ``(6n,)`` (zero: none at all). Raises ``numpy.linalg.LinAlgError`` where what is to be
     marginalised is singular.
     """
-    common = [agent for agent in receiver if agent in sender]
-    reduced, right = marginal_pair(pair, [list(sender).index(agent) for agent in common])
+    kept, others, at = _places(tuple(sender), tuple(receiver))
+    reduced, right = marginal_of_states(pair, kept, others)
     dimension = STATES_PER_AGENT * len(receiver)
     information, vector = flat * np.eye(dimension), np.zeros(dimension)
     if centre is not None:
         vector = flat * centre
-    at = states_of([list(receiver).index(agent) for agent in common])
     information[np.ix_(at, at)], vector[at] = reduced, right
     return information, vector
+
+
+@lru_cache(PAIRS_OF_FLEETS)
+def _places(sender: tuple[int, ...], receiver: tuple[int, ...]) -> tuple[Places, Places, Places]:
+    """Of the states that both have: their places at the sender and at the receiver, the sender's others between."""
+    common = [agent for agent in receiver if agent in sender]
+    kept = states_of([sender.index(agent) for agent in common])
+    others = other_states(kept, STATES_PER_AGENT * len(sender))
+    return kept, others, states_of([receiver.index(agent) for agent in common])
 
 
 def mapped_payload(payload: Payload, sender: Sequence[int], receiver: Sequence[int], centre: Vector) -> Payload:

@@ -28,9 +28,20 @@ def marginal_pair(pair: Pair, slots: Sequence[int]) -> Pair:
     With the kept states K and the others O: ``I_KK - I_KO I_OO^-1 I_OK`` and ``i_K - I_KO I_OO^-1 i_O``. Raises
     ``numpy.linalg.LinAlgError`` where ``I_OO`` is singular.
     """
-    information, vector = pair
     kept = states_of(slots)
-    others = np.setdiff1d(np.arange(len(vector)), kept)
+    return marginal_of_states(pair, kept, other_states(kept, len(pair[1])))
+
+
+def other_states(kept: NDArray[np.int64], dimension: int) -> NDArray[np.int64]:
+    """The indices below ``dimension`` that are not ``kept``, ascending."""
+    is_other = np.ones(dimension, np.bool_)
+    is_other[kept] = False
+    return np.asarray(np.flatnonzero(is_other), np.int64)
+
+
+def marginal_of_states(pair: Pair, kept: NDArray[np.int64], others: NDArray[np.int64]) -> Pair:
+    """`marginal_pair` with the states that are kept and those that are eliminated by their indices."""
+    information, vector = pair
     marginal, right = information[np.ix_(kept, kept)], vector[kept]
     if len(others):
         cross = information[np.ix_(kept, others)]

@@ -19,6 +19,14 @@ def silence_sigma_m(silent_s: float, accel_variance: float, period_s: float) -> 
     return math.sqrt(accel_variance * period_s * max(silent_s, 0.0) ** 3 / 3.0)
 
 
+def drift_variances(unseen_s: float, accel_variance: float) -> tuple[float, float]:
+    """Variances per axis, m2 and (m/s)2, that an acceleration which is not known adds to a state moved on for a time.
+
+    The acceleration, of variance q, is taken to last: ``q t^4 / 4`` and ``q t^2``.
+    """
+    return accel_variance * unseen_s**4 / 4.0, accel_variance * unseen_s**2
+
+
 def unseen_variance(unseen_ticks: int, accel_variance: float, period_s: float) -> float:
     """Variance per axis of the tick-averaged acceleration of a drone that has not been heard for some ticks.
 

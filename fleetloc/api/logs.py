@@ -74,9 +74,8 @@ def read_estimate_log(path: str | Path) -> EstimateLog:
     """Read ``agent_001.estimates``, also of a run that goes on or was killed; raises `LogFileError`."""
     header, entries = estimate_log.read_entries(Path(path))
     count, n = len(entries), len(header.agents)
-    rows, columns = np.triu_indices(STATES_PER_AGENT * n)
     mean = entries["mean"].reshape(count, n, STATES_PER_AGENT)
-    sigma = np.sqrt(entries["covariance"][:, rows == columns]).reshape(count, n, STATES_PER_AGENT)
+    sigma = np.sqrt(estimate_log.variances_of(entries, n)).reshape(count, n, STATES_PER_AGENT)
     age_ticks = entries["age_ticks"].astype(float)
     age_ticks[age_ticks >= estimate_log.MAX_AGE_TICKS] = np.inf
     return EstimateLog(

@@ -31,7 +31,7 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, loss, faults, blind drones, speed, Table I.", rich_markup_mode=None
+        help="Studies: accuracy, loss, faults, blind drones, large fleets, speed, Table I.", rich_markup_mode=None
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -42,6 +42,7 @@ def register(app: typer.Typer) -> None:
     bench.command("speed")(speed)
     bench.command("fusion")(fusion)
     bench.command("faults")(faults)
+    bench.command("scale")(scale)
     app.add_typer(bench, name="bench")
 
 
@@ -249,6 +250,42 @@ def faults(
     _prepare(None)
     results = study(fleet, selected, runs=runs, seed=seed, jobs=_jobs(jobs))
     _write({"config": str(config), "runs": runs, "seed": seed, "rows": results}, None, json_file)
+
+
+def scale(
+    sizes: Annotated[str, typer.Option(help="Drones of the fleets, separated by commas.")] = "10,20,50,100",
+    whole: Annotated[
+        str, typer.Option(help="Sizes flown besides with a joint state of the whole fleet, by commas.")
+    ] = "20",
+    joint_bodies: Annotated[
+        int, typer.Option(min=0, max=999, help="Most drones of a joint state; 0: the default of configurations.")
+    ] = 0,
+    runs: Runs = 1,
+    seed: Annotated[int, typer.Option(min=0, help="Of the first run; the next one has the next.")] = 1,
+    duration: Annotated[float, typer.Option(min=6.0, max=600.0, help="Of a flight, s.")] = 15.0,
+    settle: Annotated[float, typer.Option(min=2.0, max=60.0, help="Begin of a flight that is left out, s.")] = 5.0,
+    degree: Annotated[float, typer.Option(min=2.0, max=30.0, help="Mean number of neighbours.")] = 6.0,
+    timed: Annotated[int, typer.Option(min=1, max=100, help="Agents whose computing time is measured.")] = 4,
+    jobs: Annotated[int, typer.Option(min=0, max=256, help="Processes at a time; 0: one per processor.")] = 1,
+    json_file: JsonFile = None,
+) -> None:
+    """Fleets of up to a hundred drones: what each costs and knows.
+
+    On random geometric graphs, in virtual time; beyond some size a drone's state is that of its neighbourhood.
+    """
+    from agent.config.tables import JOINT_BODIES
+    from fleetloc.bench.scale import scale as study
+    from fleetloc.errors import InputError
+
+    if settle >= duration:
+        raise InputError("--settle", "", f"less than the flight's {duration:g} s", f"{settle:g}")
+    counts, wholes = _whole_numbers("--sizes", sizes, 2, 999), _whole_numbers("--whole", whole, 2, 999)
+    _prepare(None)
+    results = study(
+        sizes=counts, whole=wholes, joint_bodies=joint_bodies or JOINT_BODIES, runs=runs, seed=seed,
+        duration_s=duration, settle_s=settle, degree=degree, timed=timed, jobs=_jobs(jobs),
+    )  # fmt: skip
+    _write(results, None, json_file)
 
 
 def _prepare(out: Path | None) -> Path | None:

@@ -14,6 +14,7 @@ from pathlib import Path
 import msgspec
 
 from agent.config.tables import FleetConfig
+from agent.fleet.neighbourhood import is_limited
 from agent.radio.security import is_field, observer_credentials, observer_session
 from transport.errors import Rejected
 from transport.link.session import Handlers, Session, open_session
@@ -21,6 +22,7 @@ from transport.link.streams import Stream
 from transport.security.opening import Opener, Received
 
 STREAMS = (Stream.EST, Stream.DIAG)
+"""What is listened to of every drone; in a fleet larger than a joint state also its far field."""
 OnMessage = Callable[[Received], None]
 OnPresence = Callable[[int, bool, float], None]
 """(agent id, whether it is there, monotonic clock in s)."""
@@ -58,8 +60,9 @@ class FleetListener:
         handlers = Handlers(self._on_sample, self._on_there)
         session = await open_session(self._settings, self._config.fleet.name, None, self._config.ids, handlers)
         self._session = session
+        streams = (*STREAMS, Stream.FAR) if is_limited(self._config) else STREAMS
         for agent_id in self._config.ids:
-            session.subscribe(agent_id, STREAMS)
+            session.subscribe(agent_id, streams)
         session.announce()
 
     async def close(self) -> None:

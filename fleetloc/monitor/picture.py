@@ -13,12 +13,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.far_field import moved_on
 from estimators.model.layout import Layout, block, position
 from fleetloc.monitor.alarms import DroneFacts, alarms_of_drone, alarms_of_fleet
 from fleetloc.monitor.links import LinkHistory, link_view, overdue_s
 from fleetloc.monitor.monitor_table import monitor_table
 from fleetloc.monitor.views import Alarm, Drone, Ellipse, Level, Link, Picture, SeenBy, Tracks, Triple
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matrix
+from transport.messages.far_body import FarReport, FarReports
 from transport.messages.report_body import Diagnostics
 
 SIGMAS = 3.0
@@ -64,6 +66,15 @@ class _Heard:
         return self.present or self.left_s is not None or self.last_s > -np.inf
 
 
+@dataclass(frozen=True, slots=True)
+class _Reported:
+    """A drone's own report, who passed it on, and when it was true, on the monitor's clock."""
+
+    report: FarReport
+    relay: int
+    of_s: float
+
+
 class FleetPicture:
     """Takes in what a fleet sends, gives its `Picture`."""
 
@@ -74,6 +85,7 @@ class FleetPicture:
         self._stale_after_s = max(STALE_AFTER_S, 3 * period_s)
         self._lost_after_s = max(LOST_AFTER_S, 6 * period_s)
         self._heard = {agent_id: _Heard() for agent_id in config.ids}
+        self._far: dict[int, _Reported] = {}
         self._links: dict[tuple[int, int], LinkHistory] = {}
         self._since_unix_s: dict[tuple[int, str], float] = {}
         self._refused = LinkHistory()
@@ -99,6 +111,14 @@ class FleetPicture:
             heard.track.append((now_s, _position(estimate, sender)))
         while heard.track and now_s - heard.track[0][0] > self._track_s:
             heard.track.popleft()
+
+    def on_far_reports(self, sender: int, message: FarReports, now_s: float) -> None:
+        """What a drone of a large fleet passes on of others: the newest report of each is kept."""
+        for report in message.reports:
+            known = self._far.get(report.agent)
+            if report.agent != sender and (known is None or report.tick > known.report.tick):
+                age_s = (message.tick - report.tick) * self._config.fleet.period_s
+                self._far[report.agent] = _Reported(report, sender, now_s - age_s)
 
     def on_diagnostics(self, diagnostics: Diagnostics, now_s: float) -> None:
         """What a drone says of itself."""
@@ -196,7 +216,19 @@ class FleetPicture:
             age_s = ticks * self._config.fleet.period_s + since_s
             place = _position(estimate, agent_id)
             views.append(SeenBy(agent_id=other, position_m=place, sigma_m=sigma_m, age_s=age_s))
+        if agent_id in self._far:
+            views += self._reported(self._far[agent_id], now_s)
         return min(views, key=lambda view: (view.age_s, view.sigma_m), default=None)
+
+    def _reported(self, far: _Reported, now_s: float) -> list[SeenBy]:
+        """A drone as it reported itself, moved on to now; nothing of a report that its fleet has let go."""
+        age_s = max(now_s - far.of_s, 0.0)
+        if age_s > self._config.fleet.absent_after_s:
+            return []
+        mean, variance = moved_on(far.report, age_s, self._config.estimator.other_accel_variance)
+        north, east, down = mean[:3].tolist()
+        sigma_m = float(np.sqrt(variance[:3].sum()))
+        return [SeenBy(agent_id=far.relay, position_m=(north, east, down), sigma_m=sigma_m, age_s=age_s)]
 
     def _link(self, sender: int, receiver: int, now_s: float) -> Link:
         heard = self._heard[receiver]

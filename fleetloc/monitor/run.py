@@ -20,6 +20,7 @@ from fleetloc.monitor.picture import FleetPicture
 from fleetloc.monitor.views import Picture
 from fleetloc.monitor.web import Board, WebServer
 from transport.messages.estimate_body import FleetEstimate
+from transport.messages.far_body import FarReports
 from transport.messages.report_body import Diagnostics
 from transport.security.opening import Received
 
@@ -97,6 +98,8 @@ class LiveMonitor:
     def _on_message(self, received: Received) -> None:
         if isinstance(received.message, FleetEstimate):
             self.picture.on_estimate(received.sender, received.message, received.received_s)
+        elif isinstance(received.message, FarReports):
+            self.picture.on_far_reports(received.sender, received.message, received.received_s)
         elif isinstance(received.message, Diagnostics):
             self.picture.on_diagnostics(received.message, received.received_s)
 

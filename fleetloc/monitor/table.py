@@ -28,17 +28,20 @@ MAX_ALARMS = 12
 
 
 def cells(drone: Drone, links: tuple[Link, ...]) -> tuple[str, ...]:
-    """What is shown of a drone after its id and status."""
+    """What is shown of a drone after its id and status; of one that is not heard what another has of it."""
     place = (UNKNOWN,) * 3
-    if drone.position_m is not None:
-        north, east, down = drone.position_m
+    position_m, age_s = drone.position_m, drone.estimate_age_s
+    if position_m is None and drone.seen_by is not None:
+        position_m, age_s = drone.seen_by.position_m, drone.seen_by.age_s
+    if position_m is not None:
+        north, east, down = position_m
         place = (f"{north:.1f}", f"{east:.1f}", f"{-down:.1f}")
     ellipse = drone.ellipse
     heard = (_heard(link) for link in links if link.receiver == drone.agent_id and link.age_s is not None)
     return (
         *place,
         UNKNOWN if ellipse is None else f"{ellipse.major_m:.2f}/{ellipse.up_m:.2f}",
-        _number(drone.estimate_age_s, 1.0),
+        _number(age_s, 1.0),
         " ".join(part for part in (drone.gps, _gps_age(drone)) if part) or UNKNOWN,
         ", ".join(heard) or UNKNOWN,
         _number(drone.tick_p99_s, 1e3),

@@ -28,14 +28,14 @@ class Ellipse(View, frozen=True):
 
 
 class SeenBy(View, frozen=True):
-    """Where a neighbour, itself heard, has a drone."""
+    """Where another drone, itself heard, has a drone: by its own estimate, or as a report that it passed on says."""
 
     agent_id: int
     position_m: Triple
     sigma_m: float
     """Root of the sum of the variances of its axes."""
     age_s: float
-    """Since anything of the drone entered that neighbour's estimate."""
+    """Since anything of the drone entered that neighbour's estimate, or since the tick of the report."""
 
 
 class Drone(View, frozen=True):

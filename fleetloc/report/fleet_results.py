@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.fleet.membership import is_absent
-from agent.log.estimate_log import covariance_of, entry_dtype, read_entries
+from agent.log.estimate_log import covariance_of, entry_dtype, read_entries, variances_of
 from estimators.estimator import Status
 from estimators.integrity.consistency import nees
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
@@ -113,7 +113,7 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     absent = np.repeat(is_absent(entries["age_ticks"]), STATES_PER_AGENT, axis=1)
     error[absent] = 0.0  # nothing is said of them
     known = np.asarray(entries["status"] != Status.NO_DATA)
-    covariance_diagonal = np.array([covariance_of(entry, len(config.ids)).diagonal()[own] for entry in entries])
+    covariance_diagonal = variances_of(entries, len(config.ids))[:, own]
     latency_s = entries["published_s"] - entries["t_s"] - period_s
     on_time = np.asarray(latency_s <= period_s + ROUNDING_S)
     first_tick = int(np.ceil((start_s - ROUNDING_S) / period_s))

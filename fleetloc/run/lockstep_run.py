@@ -6,7 +6,7 @@ import gc
 from pathlib import Path
 
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
+from agent.log.estimate_log import EstimateLogWriter, header_of
 from agent.log.run_logs import ESTIMATES_MB, MB
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
@@ -21,17 +21,10 @@ from transport.messages.report_body import Diagnostics
 
 def fly_in_lockstep(config: FleetConfig, directory: Path) -> RunOutcome:
     """Fly the scenario and write truth and records; there is no computing time in virtual time, it is given as 0."""
-    fleet = config.fleet
     recorders = {
         agent_id: EstimateLogWriter(
             run_files.record_path(directory, agent_id),
-            EstimateLogHeader(
-                fleet=fleet.name,
-                agent=agent_id,
-                agents=config.ids,
-                period_s=fleet.period_s,
-                epoch_unix_s=fleet.epoch_unix_s,
-            ),
+            header_of(config, agent_id),
             int(ESTIMATES_MB * MB),
         )
         for agent_id in config.ids

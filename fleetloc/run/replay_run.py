@@ -24,7 +24,7 @@ from pathlib import Path
 import numpy as np
 
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import EstimateLogHeader, EstimateLogWriter
+from agent.log.estimate_log import EstimateLogWriter, header_of
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.samples import AutopilotEstimate, GpsSample
@@ -145,17 +145,9 @@ class ReplayWriter:
         self._fit_s: dict[int, float] = {}
         self._noted_s: dict[int, float] = {}
         self._recorders: dict[int, EstimateLogWriter] = {}
-        fleet = config.fleet
         for agent_id in agents:
-            header = EstimateLogHeader(
-                fleet=fleet.name,
-                agent=agent_id,
-                agents=config.ids,
-                period_s=fleet.period_s,
-                epoch_unix_s=fleet.epoch_unix_s,
-            )
             record = run_files.record_path(directory, agent_id)
-            self._recorders[agent_id] = EstimateLogWriter(record, header, sys.maxsize)
+            self._recorders[agent_id] = EstimateLogWriter(record, header_of(config, agent_id), sys.maxsize)
 
     def on_estimate(self, agent: OnboardAgent, ready: EstimateReady) -> None:
         """Write an estimate, and note now and then the latency, and how well the measurements fit."""

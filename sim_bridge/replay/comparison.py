@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.fleet.tracking import ABSENT_VARIANCE
-from agent.log.estimate_log import record_chunks
+from agent.log.estimate_log import covariance_of, record_chunks, variances_of
 from estimators.estimator import Status
 from estimators.model.layout import STATES_PER_AGENT, Layout, block
 from sim_bridge.replay.statistics import Floats, Spread, Thinned
@@ -125,9 +125,7 @@ def located(
     chunk: NDArray[np.void], layout: Layout, agent_id: int, below_m2: float = PLACE_HOLDER * ABSENT_VARIANCE
 ) -> NDArray[np.bool_]:
     """``(K,)``: whether an agent is located in the entries, the variance of its position north below a limit."""
-    first = BLOCK * layout.slot(agent_id)
-    diagonal = first * layout.dimension - first * (first - 1) // 2
-    return np.asarray(chunk["covariance"][:, diagonal] < below_m2)
+    return np.asarray(variances_of(chunk, layout.size)[:, BLOCK * layout.slot(agent_id)] < below_m2)
 
 
 def _compare_chunk(
@@ -142,7 +140,7 @@ def _compare_chunk(
     own = block(layout.slot(result.agent_id))
     truth = np.hstack([_truth_of(references.get(agent), t_s) for agent in layout.agents])
     error = np.asarray(chunk["mean"]) - truth
-    covariance = _covariances(chunk, layout.dimension)
+    covariance = np.array([covariance_of(entry, layout.size) for entry in chunk])
     autopilot = references[result.agent_id].autopilot.at(t_s, MAX_AUTOPILOT_GAP_S)
     to_autopilot = chunk["mean"][:, own] - autopilot
     flown = np.concatenate([np.r_[block(layout.slot(agent))] for agent in references])
@@ -192,15 +190,6 @@ def _add_position(whole: Spread | None, horizontal: Spread, vertical: Spread, er
 
 def _truth_of(references: ComparedTracks | None, t_s: Floats) -> Floats:
     return np.full((len(t_s), BLOCK), np.nan) if references is None else references.truth.at(t_s, MAX_TRUTH_GAP_S)
-
-
-def _covariances(chunk: NDArray[np.void], dimension: int) -> Floats:
-    """``(K, d, d)`` of the packed triangles."""
-    rows, columns = np.triu_indices(dimension)
-    full = np.zeros((len(chunk), dimension, dimension))
-    full[:, rows, columns] = chunk["covariance"]
-    full[:, columns, rows] = chunk["covariance"]
-    return full
 
 
 def _nees(error: Floats, covariance: Floats) -> Floats:

@@ -26,7 +26,7 @@ from agent.sensing.frames import FleetFrame
 from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.fleet_events import FleetEvents
-from sim_bridge.virtual.virtual_fleet import OnEstimate, VirtualDrone, VirtualFleet, channel_of
+from sim_bridge.virtual.virtual_fleet import OnEstimate, Tap, VirtualDrone, VirtualFleet, channel_of
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.sensor_feed import Sensed, SensorFeed
@@ -73,6 +73,10 @@ class Surroundings:
     """Changes what an agent reads from its autopilot: (agent, bytes) -> reads."""
     lateness_s: Callable[[], float] = lambda: 0.0
     """How much later than asked for each thing happens."""
+    make_agent: Callable[..., OnboardAgent] = OnboardAgent
+    """What makes the agents; another one may listen to what comes in."""
+    tap: Tap | None = None
+    """Follows packets."""
     host_start_s: float = HOST_START_S
     """The virtual monotonic clock at the start."""
 
@@ -116,6 +120,7 @@ class FleetLockstep:
             on_estimate,
             unix_offset_s=self._unix_offset_s,
             to_autopilot=self._on_frame,
+            tap=around.tap,
             lateness_s=around.lateness_s,
         )
         self._end_s = self._start_s
@@ -156,7 +161,7 @@ class FleetLockstep:
         """An agent that begins; ``away`` ones begin anew when they come back."""
         self._lives[agent_id] += 1
         identity = self._around.identities.get(agent_id, Identity(boot=self._lives[agent_id]))
-        agent = OnboardAgent(
+        agent = self._around.make_agent(
             self._config,
             agent_id,
             self._make_estimator,

@@ -49,6 +49,7 @@ QUALITY = {
     Stream.MEAS: Quality(zenoh.Priority.INTERACTIVE_LOW, True, _RELIABLE),
     Stream.INFO: Quality(zenoh.Priority.INTERACTIVE_HIGH, True, _BEST_EFFORT),
     Stream.EST: Quality(zenoh.Priority.DATA_LOW, False, _RELIABLE),
+    Stream.FAR: Quality(zenoh.Priority.DATA, False, _RELIABLE),
     Stream.DIAG: Quality(zenoh.Priority.BACKGROUND, False, _RELIABLE),
     Stream.UWB: Quality(zenoh.Priority.DATA_HIGH, True, _BEST_EFFORT),
 }

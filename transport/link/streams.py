@@ -29,6 +29,8 @@ class Stream(StrEnum):
     """Consensus information, every round."""
     EST = "est"
     """The agent's estimate of the fleet, every tick."""
+    FAR = "far"
+    """Of fleets too large for one joint state: what drones report of themselves, passed on hop by hop at 1 Hz."""
     UWB = "uwb"
     """Ranges from a UWB driver process to the agent of the same id (``uwb-range/1``, no packet header)."""
     ALIVE = "alive"

@@ -2,7 +2,7 @@
 
 Little endian ``<2sBBHHIIIHHqII``: magic ``CL``, version, kind, sender, flags, boot, sequence number (per
 sender and kind), tick, round, n, time, body length, fleet. ``n`` counts what the body holds: records of a
-measurement body, agents of an information or estimate body, 0 otherwise.
+measurement body, agents of an information or estimate body, reports of a far-field body, 0 otherwise.
 """
 
 from __future__ import annotations
@@ -38,6 +38,7 @@ class PacketKind(IntEnum):
     EST = 3
     CLOCK = 5
     DIAG = 6
+    FAR = 7
 
 
 STREAM_OF_KIND = {kind: Stream[kind.name] for kind in PacketKind}
@@ -48,6 +49,7 @@ MAX_BODY_BYTES = {
     PacketKind.EST: 64 * 1024,
     PacketKind.CLOCK: 64,
     PacketKind.DIAG: 16 * 1024,
+    PacketKind.FAR: MAX_DATAGRAM_BODY_BYTES,
 }
 MAX_PACKET_BYTES = HEADER_BYTES + max(MAX_BODY_BYTES.values()) + SIGNATURE_BYTES
 

@@ -25,6 +25,7 @@ from typing import ClassVar, NamedTuple
 
 from transport.errors import EncodeError, Reason, Rejected
 from transport.link.streams import MAX_AGENT_ID, MIN_AGENT_ID
+from transport.messages.half_floats import half_up
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 
 Triple = tuple[float, float, float]
@@ -217,7 +218,6 @@ _AGE_AT = 3
 _IDENTITY = struct.Struct("<BHq")
 _SINGLES = [struct.Struct(f"<{count}f") for count in range(5)]
 """What follows the identity's head: an agent's id is exact as a float32."""
-_HALF, _HALF_BITS = struct.Struct("<e"), struct.Struct("<H")
 RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
 
 
@@ -307,18 +307,13 @@ def _decode_body(body: bytes, tick: int, count: int) -> tuple[tuple[Measurement,
     return tuple(records), frozenset(named)
 
 
+def forget_decoded() -> None:
+    """Know no record again by its bytes: for a study that times an agent as if it were alone in its process."""
+    _decode_body.cache_clear()
+    _decode_record.cache_clear()
+
+
 # --- one record --------------------------------------------------------------------------------------------
-
-
-def _half_up(value: float) -> float:
-    """The smallest float16 not below ``value`` >= 0; inf beyond its range."""
-    if value > 65504.0:
-        return math.inf
-    packed = _HALF.pack(value)
-    rounded: float = _HALF.unpack(packed)[0]
-    if rounded < value:
-        rounded = _HALF.unpack(_HALF_BITS.pack(_HALF_BITS.unpack(packed)[0] + 1))[0]
-    return rounded
 
 
 def _encode_record(record: _Record) -> bytes | None:
@@ -337,10 +332,10 @@ def _encode_record(record: _Record) -> bytes | None:
     for half_width in half_widths:
         if not half_width > 0:
             raise EncodeError(f"{record}: half widths must be positive (inf = no bound)")
-    sigmas = [_half_up(math.sqrt(variance)) for variance in variances]
+    sigmas = [half_up(math.sqrt(variance)) for variance in variances]
     if math.inf in sigmas:
         return None
-    rounded_widths = [_half_up(half_width) for half_width in half_widths]
+    rounded_widths = [half_up(half_width) for half_width in half_widths]
     layout = _LAYOUT[record.kind]
     return layout.pack(record.kind, record.observer, 0, *middle, *values, *sigmas, *rounded_widths)
 

@@ -10,6 +10,7 @@ from transport.link.peers import PeerTable
 from transport.link.streams import check_agent_id, check_fleet_name, parse_key
 from transport.messages.clock_body import decode_clock_answer
 from transport.messages.estimate_body import decode_estimate
+from transport.messages.far_body import decode_far_reports
 from transport.messages.header import (
     FLAG_FLOAT64,
     HEADER_BYTES,
@@ -146,6 +147,8 @@ class Opener:
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)
             case PacketKind.EST:
                 return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
+            case PacketKind.FAR:
+                return decode_far_reports(body, tick=h.tick, count=h.n, roster=self._roster)
             case PacketKind.CLOCK:
                 return decode_clock_answer(body)
             case PacketKind.DIAG:

@@ -8,6 +8,7 @@ from transport.errors import EncodeError
 from transport.link.streams import Stream, check_agent_id, key_expression
 from transport.messages.clock_body import ClockAnswer, encode_clock_answer
 from transport.messages.estimate_body import FleetEstimate, encode_estimate
+from transport.messages.far_body import FarReports, encode_far_reports
 from transport.messages.header import (
     FLAG_FLOAT64,
     MAX_BODY_BYTES,
@@ -22,7 +23,7 @@ from transport.messages.measurement_body import Measurements, encode_measurement
 from transport.messages.report_body import Diagnostics, encode_diagnostics
 from transport.security.auth import Signing, Unsigned, sign
 
-Message = Measurements | Information | FleetEstimate | Diagnostics | ClockAnswer
+Message = Measurements | Information | FleetEstimate | FarReports | Diagnostics | ClockAnswer
 """Everything that travels in a packet."""
 
 
@@ -85,6 +86,8 @@ class Sealer:
                 data = encode_estimate(message, double=bool(double))
                 flags = FLAG_FLOAT64 if double else 0
                 return [_Body(PacketKind.EST, data, message.tick, n=len(message.agents), flags=flags)]
+            case FarReports():
+                return [_Body(PacketKind.FAR, encode_far_reports(message), message.tick, n=len(message.reports))]
             case Diagnostics():
                 return [_Body(PacketKind.DIAG, encode_diagnostics(message))]
             case ClockAnswer():

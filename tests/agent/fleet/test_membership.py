@@ -145,6 +145,29 @@ def test_two_places_are_not_chosen_between(agent: Agent) -> None:
     assert last.covariance[0, 0] > 50.0**2
 
 
+def test_a_joint_state_with_little_room_follows_who_is_near(make_config: MakeConfig) -> None:
+    # GIVEN room for three of five, and drones 2 and 3 that range drone 1
+    overrides = ("estimator.kind=dmhe_shared", "estimator.rounds=0", "fleet.joint_bodies=3")
+    agent = Agent(make_config(5, *overrides))
+    agent.run(25, heard=(1, 2, 3), ranges=((1, 2), (1, 3), (2, 3)))
+    assert agent.members == (1, 2, 3)
+    # WHEN drone 4 comes, which is no nearer: nothing changes, and what it says is let go
+    agent.run(25, heard=(1, 2, 3, 4), ranges=((1, 2), (1, 3), (2, 3), (1, 4)))
+    assert agent.members == (1, 2, 3)
+    assert agent.store.refused["beyond the joint state"] > 20
+    # WHEN drone 3 is out of reach for longer than a link is remembered
+    moved = agent.run(80, heard=(1, 2, 4), ranges=((1, 2), (1, 4), (2, 4)))
+    # THEN drone 4 is in in its place, at its own, without a start anew
+    assert agent.members == (1, 2, 4)
+    assert agent.counters["starts"] == 1
+    for slot, member in enumerate(agent.members):
+        error = moved[-1].mean[6 * slot : 6 * slot + 3] - AWAY[member - 1]
+        sigma = np.sqrt(moved[-1].covariance.diagonal()[6 * slot : 6 * slot + 3])
+        assert (np.abs(error) < 5.0 * sigma).all()
+        assert np.linalg.norm(error) < 0.3
+    assert {estimate.status for estimate in moved} == {Status.OK}
+
+
 def pair(agents: tuple[int, ...], sigma_m: float, tick: int = 5) -> Information:
     mean = np.concatenate([[*AWAY[a - 1], 0.0, 0.0, 0.0] for a in agents])
     information = np.eye(len(mean)) / sigma_m**2

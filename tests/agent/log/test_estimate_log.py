@@ -9,15 +9,19 @@ import pytest
 
 from agent.errors import LogFileError
 from agent.log.estimate_log import (
+    FORMAT_JOINT,
     EstimateLogHeader,
     EstimateLogWriter,
     covariance_of,
     entry_dtype,
     read_entries,
+    record_chunks,
+    variances_of,
     write_summary,
 )
 from agent.outputs import EstimateReady
 from estimators.estimator import Estimate, Status
+from estimators.model.layout import states_of
 
 HEADER = EstimateLogHeader(fleet="test", agent=1, agents=(1, 2), period_s=0.1, epoch_unix_s=5.0)
 
@@ -94,3 +98,38 @@ def test_what_is_no_record_is_named(tmp_path: Path) -> None:
         EstimateLogWriter(tmp_path / "file" / "a.estimates", HEADER, 10**6)
     with pytest.raises(LogFileError, match="cannot be written"):
         write_summary(tmp_path / "file" / "a.json", {})
+
+
+def test_a_record_of_a_large_fleet_holds_a_joint_state_and_the_variances_of_all(tmp_path: Path) -> None:
+    agents = tuple(range(1, 9))
+    header = EstimateLogHeader(
+        format=FORMAT_JOINT, fleet="test", agent=2, agents=agents, period_s=0.1, epoch_unix_s=5.0, joint=3
+    )
+    rng = np.random.default_rng(5)
+    covariances = []
+    writer = EstimateLogWriter(tmp_path / "agent_002.estimates", header, 10**6)
+    for tick, joint in enumerate([(2, 3, 7), (2,), (1, 2)]):
+        covariance = np.diag(rng.uniform(1.0, 2.0, 48))
+        at = states_of([agent - 1 for agent in joint])
+        half = rng.normal(size=(len(at), len(at)))
+        covariance[np.ix_(at, at)] = half @ half.T
+        covariances.append(covariance)
+        estimate = Estimate(tick, rng.normal(size=48), covariance, Status.OK, np.zeros(8, np.int64))
+        writer.write(EstimateReady(estimate, 0.1 * tick, 0.1 * tick + 0.12, True, joint), 0.1 * tick + 0.13, 0.0)
+    writer.close()
+    read, entries = read_entries(writer.path)
+    (chunk,) = record_chunks(writer.path, 8)
+    assert read == header
+    for k, covariance in enumerate(covariances):
+        np.testing.assert_array_equal(covariance_of(entries[k], 8), covariance)
+        np.testing.assert_array_equal(covariance_of(chunk[k], 8), covariance)
+        np.testing.assert_array_equal(variances_of(entries, 8)[k], covariance.diagonal())
+    assert entry_dtype(100, 10).itemsize < 0.02 * entry_dtype(100).itemsize
+
+
+def test_variances_are_the_diagonal_of_a_whole_covariance_too(tmp_path: Path) -> None:
+    writer = EstimateLogWriter(tmp_path / "agent_001.estimates", HEADER, 10**6)
+    writer.write(ready(1, 3), 0.0, 0.0)
+    writer.close()
+    _, entries = read_entries(writer.path)
+    np.testing.assert_array_equal(variances_of(entries, 2)[0], ready(1, 3).estimate.covariance.diagonal())

@@ -18,14 +18,16 @@ from fleetloc.monitor.links import LOSS_WINDOW_S, LinkHistory
 from fleetloc.monitor.picture import FleetPicture, ellipse_of
 from fleetloc.monitor.views import Alarm, Drone, Picture
 from tests.support.beacon import diagnostics, fleet_estimate
+from transport.messages.far_body import FarReport, FarReports
 from transport.messages.report_body import Diagnostics
 
 UNIX_S = 1_800_000_000.0
+FLEET = {"name": "watched", "origin": {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 500.0}}
 
 
 def fleet(**tables: object) -> FleetConfig:
     document = {
-        "fleet": {"name": "watched", "origin": {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 500.0}},
+        "fleet": FLEET,
         "agents": [{"id": i, "mavlink": f"udpin:127.0.0.1:{24550 + i}"} for i in (1, 2, 3)],
     }
     return config_from(document | tables, "test")
@@ -268,3 +270,28 @@ def test_loss_starts_anew_with_the_receiver() -> None:
     for when_s, received, lost in [(0.0, 500, 500), (1.0, 510, 510), (2.0, 5, 0), (3.0, 15, 0)]:
         history.add(when_s, received, lost)
     assert history.loss == 0.0
+
+
+def test_a_drone_that_only_others_report_of_is_shown_with_its_age_until_its_fleet_lets_it_go() -> None:
+    # GIVEN a monitor that hears drone 1 alone, which passes on what drone 3 said of itself 0.7 s before
+    picture = FleetPicture(fleet(fleet={**FLEET, "joint_bodies": 2}))
+    sigmas = (0.3, 0.3, 0.4)
+    report = FarReport(3, 993, 0, (100.0, 20.0, -30.0), (2.0, 0.0, 0.0), sigmas, (0.1, 0.1, 0.1))
+    picture.on_far_reports(1, FarReports(1000, (report,)), 50.0)
+    picture.on_far_reports(2, FarReports(1001, (replace(report, tick=983),)), 50.1)  # an older one, by another way
+    # WHEN one looks
+    seen = drone(picture.at(50.0, UNIX_S), 3).seen_by
+    later = drone(picture.at(51.0, UNIX_S), 3)
+    # THEN it is where it flew on to, less sure than it was, and the older the less
+    assert seen is not None
+    assert later.seen_by is not None
+    assert (seen.agent_id, seen.age_s, later.seen_by.age_s) == (1, pytest.approx(0.7), pytest.approx(1.7))
+    assert seen.position_m == pytest.approx((101.4, 20.0, -30.0))
+    assert later.seen_by.position_m == pytest.approx((103.4, 20.0, -30.0))
+    assert math.hypot(*sigmas) < seen.sigma_m < later.seen_by.sigma_m
+    assert later.position_m is None
+    north, _, up, *_, age_s = table.cells(later, ())[:5]
+    assert (north, up, age_s) == ("103.4", "30.0", "1.7")
+    # WHEN nothing more comes for as long as a drone is kept
+    assert drone(picture.at(50.0 + 9.2, UNIX_S), 3).seen_by is not None
+    assert drone(picture.at(50.0 + 9.4, UNIX_S), 3).seen_by is None

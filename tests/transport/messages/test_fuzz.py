@@ -13,6 +13,7 @@ from transport.errors import Rejected
 from transport.link.streams import key_expression
 from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
+from transport.messages.far_body import FarReport, FarReports
 from transport.messages.header import HEADER, HEADER_BYTES, STREAM_OF_KIND, PacketKind
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import (
@@ -50,6 +51,7 @@ MESSAGES: list[Message] = [
     Information(9, 1, 8, 6, (1, 2), np.eye(12) + 0.5, np.ones(12)),
     Information(9, 0, 8, 6, (1, 2, 3, 4), np.eye(24) + 0.5, np.ones(24)),
     FleetEstimate(9, 0, (2, 3), np.arange(12.0), np.ones(12), (0, 1), np.eye(6)),
+    FarReports(9, (FarReport(2, 9, 0, ONES, ONES, ONES, ONES), FarReport(4, 3, 3, ONES, ONES, ONES, ONES))),
     Diagnostics(2, "NOMINAL", ("why",), {"received": 3}, {"age_s": 0.5}),
     ClockAnswer(1, 2, 3),
 ]
@@ -102,6 +104,14 @@ def assert_sound(message: Message | None) -> None:
             assert set(message.agents) <= set(ROSTER)
             assert np.isfinite(message.mean).all()
             assert (message.variance >= 0).all()
+        case FarReports():
+            for report in message.reports:
+                state = (*report.position_m, *report.velocity_mps)
+                sigmas = (*report.position_sigma_m, *report.velocity_sigma_mps)
+                assert np.isfinite((*state, *sigmas)).all()
+                assert min(sigmas) > 0.0
+                assert report.agent in ROSTER
+                assert 0 <= report.tick <= message.tick
         case Diagnostics():
             assert message.agent_id == SENDER
         case _:

@@ -9,8 +9,9 @@ estimate, of covariance P with the image at an offset d, left of the image at th
     CREDIT / 2 d' P^-1 d,
 
 and every tick that leaves the window adds the difference of the log likelihoods of its rows, foretold from the
-beliefs about the window's start (Bar-Shalom, Li, Kirubarajan, Estimation with Applications, 2001, ch. 11). The doubt
-ends when the odds are decisive, or when both have become one place again.
+beliefs about the window's start (Bar-Shalom, Li, Kirubarajan, Estimation with Applications, 2001, ch. 11). What is
+still in the window counts by half the difference of the two optima. Where the rival is far likelier, the two change
+places. The doubt ends when the odds are decisive for the estimate, or when both have become one place again.
 """
 
 from __future__ import annotations
@@ -20,10 +21,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.integrity.mirror_images import flat, image_of
+from estimators.integrity.ambiguity import Body
+from estimators.integrity.mirror_images import flat, image_of, mirror
 from estimators.integrity.observability import row_jacobian
 from estimators.integrity.thresholds import CERTAIN_NATS, CREDIT, DIRECTIONS, SURE_NATS
-from estimators.model.gaussian import covering
+from estimators.model.gaussian import reseated
 from estimators.model.layout import STATES_PER_AGENT, block
 from estimators.model.measurements import Kind, Matrix, RowTable
 from estimators.model.row_kernels import POSITION, PRECISION, any_of
@@ -36,6 +38,11 @@ MERGED_SQUARE = 1.0
 """The same, below which they are one again."""
 MIRRORED_SPREAD = 2.0
 """Factor on the covariance of the image: the estimate has been bent towards its own side."""
+MOST_NATS = 3.0
+"""Log odds at most that an estimate begins with: rows linearised at one side, tick after tick, may have told of it
+what they do not know, and then it is far surer than it should be."""
+LEADING_NATS = 6.0
+"""Log odds for the rival from which on the two change places: what the window says goes up and down by a few."""
 SETTLING_TICKS = 10
 """A new rival is given so long to find its place, before the two are compared: it is less sure at first, and loses
 for that what tells of neither."""
@@ -52,14 +59,26 @@ class Rival:
     belief: SlowBelief
     last: SlowSolution | None
     lead_nats: float
-    """Log odds of the estimate against it."""
+    """Log odds of the estimate against it, before the rows of the window."""
+    present_nats: float = 0.0
+    """What the rows of the window add to them."""
     ticks: int = 0
     """How long it has been held."""
 
     @property
+    def odds_nats(self) -> float:
+        """Log odds of the estimate against it, by all that was measured."""
+        return self.lead_nats + self.present_nats
+
+    @property
+    def leads(self) -> bool:
+        """Whether it is to be the estimate."""
+        return self.ticks > SETTLING_TICKS and self.odds_nats < -LEADING_NATS
+
+    @property
     def probability(self) -> float:
         """Of the rival, 0..1."""
-        return float(1.0 / (1.0 + np.exp(np.clip(self.lead_nats, -CERTAIN_NATS, CERTAIN_NATS))))
+        return float(1.0 / (1.0 + np.exp(np.clip(self.odds_nats, -CERTAIN_NATS, CERTAIN_NATS))))
 
     def covered(self, path: Matrix, covariance: Matrix) -> Matrix:
         """The mean square error ``(6n, 6n)`` of an estimate whose last state is ``path[-1]``, over both."""
@@ -70,10 +89,23 @@ class Rival:
         p = self.probability
         return np.asarray((1.0 - p) * covariance + p * (theirs + np.outer(away, away)), np.float64)
 
-    def weighed(self, gained_nats: float, belief: SlowBelief, last: SlowSolution) -> Rival:
-        """A tick later."""
+    def weighed(self, gained_nats: float, last: SlowSolution, cost: float) -> Rival:
+        """A tick later; ``last`` is its solution, ``cost`` the estimate's."""
         lead = self.lead_nats + (gained_nats if self.ticks >= SETTLING_TICKS else 0.0)
-        return replace(self, belief=belief, last=last, lead_nats=lead, ticks=self.ticks + 1)
+        present = 0.5 * (last.cost - cost)
+        return replace(
+            self, belief=last.arrival, last=last, lead_nats=lead, present_nats=present, ticks=self.ticks + 1
+        )
+
+    def exchanged(self, estimate: SlowSolution) -> Rival:
+        """The estimate as the rival of this one."""
+        return replace(
+            self,
+            belief=estimate.arrival,
+            last=estimate,
+            lead_nats=-self.lead_nats,
+            present_nats=-self.present_nats,
+        )
 
 
 class Passages:
@@ -108,7 +140,7 @@ class Passages:
             self._lead_nats[slot] = min(self._lead_nats[slot], 0.5 * CREDIT * square)
             lead = float(self._lead_nats[slot])
             if lead < SURE_NATS and square_m > APART_SQUARE and (found is None or lead < found.lead_nats):
-                found = Rival(slot, _mirrored(arrival, slot, bodies), None, lead)
+                found = Rival(slot, _mirrored(arrival, slot, bodies), None, min(lead, MOST_NATS))
         return found
 
 
@@ -160,22 +192,46 @@ def _distances(arrival: SlowBelief, slot: int, bodies: Sequence[int]) -> tuple[f
     The covariance is that relative to the bodies' centre: what all share moves both.
     """
     states = arrival.mean[: arrival.states].reshape(-1, STATES_PER_AGENT)
-    relative = np.zeros((STATES_PER_AGENT, len(arrival.mean)))
-    relative[:, block(slot)] = np.eye(STATES_PER_AGENT)
-    for other in bodies:
-        relative[:, block(other)] = -np.eye(STATES_PER_AGENT) / len(bodies)
-    spread = relative @ arrival.covariance @ relative.T
+    spread = _relative_spread(arrival, slot, bodies)
     image, _ = image_of(states[slot], spread, states[bodies][:, :3], states[bodies][:, 3:])
     away = image - states[slot]
     square = float(away @ np.linalg.solve(spread, away))
     return square, float(away[:3] @ np.linalg.solve(spread[:3, :3], away[:3]))
 
 
+def _relative_spread(arrival: SlowBelief, slot: int, bodies: Sequence[int]) -> Matrix:
+    """The covariance ``(6, 6)`` of a drone's state relative to the centre of bodies."""
+    relative = np.zeros((STATES_PER_AGENT, len(arrival.mean)))
+    relative[:, block(slot)] = np.eye(STATES_PER_AGENT)
+    for other in bodies:
+        relative[:, block(other)] = -np.eye(STATES_PER_AGENT) / len(bodies)
+    return np.asarray(relative @ arrival.covariance @ relative.T, np.float64)
+
+
+def placed(arrival: SlowBelief, slot: int, there: Body, bodies: Sequence[int]) -> SlowBelief:
+    """The belief with a drone at a place, known relative to the centre of ``bodies``; of them it holds the same."""
+    mean, onto = arrival.mean.copy(), np.zeros((STATES_PER_AGENT, len(arrival.mean)))
+    mean[block(slot)] = there[0]
+    for other in bodies:
+        onto[:, block(other)] = np.eye(STATES_PER_AGENT) / len(bodies)
+    return replace(arrival, mean=mean, covariance=reseated(arrival.covariance, slot, onto, there[1]))
+
+
 def _mirrored(arrival: SlowBelief, slot: int, bodies: Sequence[int]) -> SlowBelief:
-    """The belief with a drone at its image, less sure of it; of the others it holds the same."""
+    """The belief with a drone at its image, less sure of it; of the others it holds the same.
+
+    What the drone shares with them goes with it, as do the slow errors that its place hangs on: only what is across
+    the plane is turned round.
+    """
     states = arrival.mean[: arrival.states].reshape(-1, STATES_PER_AGENT)
-    own = arrival.covariance[block(slot), block(slot)]
-    image, spread = image_of(states[slot], own, states[bodies][:, :3], states[bodies][:, 3:])
+    places, velocities = states[bodies][:, :3], states[bodies][:, 3:]
+    image, spread = image_of(states[slot], _relative_spread(arrival, slot, bodies), places, velocities)
+    turn = mirror(places)
+    onto = np.zeros((STATES_PER_AGENT, len(arrival.mean)))
+    onto[:, block(slot)] = turn
+    for other in bodies:
+        onto[:, block(other)] = (np.eye(STATES_PER_AGENT) - turn) / len(bodies)
     mean = arrival.mean.copy()
     mean[block(slot)] = image
-    return replace(arrival, mean=mean, covariance=covering(arrival.covariance, MIRRORED_SPREAD * spread, slot))
+    excess = (MIRRORED_SPREAD - 1.0) * spread
+    return replace(arrival, mean=mean, covariance=reseated(arrival.covariance, slot, onto, excess))

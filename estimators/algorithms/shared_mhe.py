@@ -18,7 +18,7 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from estimators.algorithms.rival import Passages, Rival, log_likelihood, merged
+from estimators.algorithms.rival import Passages, Rival, log_likelihood, merged, placed
 from estimators.algorithms.shared_monitors import Belief, SharedMonitors, Verdict
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, SolverReport, Status
@@ -175,7 +175,7 @@ class SharedMovingHorizonEstimator:
     def _compared(
         self, problem: SlowProblem, solution: SlowSolution, budget: int | None
     ) -> tuple[SlowProblem, SlowSolution, int]:
-        """The window and its solution, or those of the rival if it has won; and how often that happened."""
+        """The window and its solution, or those of the rival if it leads now; and how often that happened."""
         rival = self._rival
         if rival is None:
             return problem, solution, 0
@@ -188,15 +188,15 @@ class SharedMovingHorizonEstimator:
         if self.window.full:
             gained_nats = log_likelihood(problem, solution, self.belief.covariance)
             gained_nats -= log_likelihood(theirs, elsewhere, rival.belief.covariance)
-        self._rival = rival = rival.weighed(gained_nats, elsewhere.arrival, elsewhere)
-        if rival.lead_nats < -DECISIVE_NATS:
-            self._drop_rival(rival)
-            return theirs, elsewhere, 1
-        if rival.lead_nats > DECISIVE_NATS:
+        rival, moves = rival.weighed(gained_nats, elsewhere, solution.cost), 0
+        if rival.leads:
+            rival, problem, solution, moves = rival.exchanged(solution), theirs, elsewhere, 1
+        self._rival = rival
+        if rival.odds_nats > DECISIVE_NATS:
             self._drop_rival(rival)
         elif merged(rival, solution):
             self._rival = None
-        return problem, solution, 0
+        return problem, solution, moves
 
     def _other_place(self, problem: SlowProblem, solution: SlowSolution, verdict: Verdict) -> Rival | None:
         """The place that a drone may be at instead: its mirror image, or where its data hold to."""
@@ -207,7 +207,8 @@ class SharedMovingHorizonEstimator:
         if verdict.elsewhere is None:
             return None
         slot, there = verdict.elsewhere
-        return Rival(slot, solution.arrival.with_states(there.mean, there.covariance()), None, 0.0)
+        bodies = [each for each in located if each != slot]
+        return Rival(slot, placed(solution.arrival, slot, there, bodies), None, 0.0)
 
     def _is_possible(self, rival: Rival) -> bool:
         """Whether a rival's drone is where it may be."""

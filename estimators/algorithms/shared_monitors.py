@@ -30,7 +30,6 @@ from estimators.integrity.finding import What, has
 from estimators.integrity.fleet_mirror import FleetMirrorMonitor, MirrorImage, mirror_offset, mirrored
 from estimators.integrity.thresholds import FLOOR_M, UNDERSTATED
 from estimators.integrity.window_evidence import WindowEvidence
-from estimators.model.gaussian import covering
 from estimators.model.layout import STATES_PER_AGENT, Layout, block
 from estimators.model.limits import StateLimits
 from estimators.model.measurements import Matrix, RowTable, Vector, empty_rows
@@ -66,8 +65,8 @@ class Verdict:
     """``(n,)`` whose place the data tell."""
     moves: int
     """How often the belief was moved to where the data hold."""
-    elsewhere: tuple[int, InformationState] | None = None
-    """A drone whose data hold to another place, and the arrival cost with it there."""
+    elsewhere: tuple[int, Body] | None = None
+    """A drone whose data hold to another place, and its state there at the first tick of the next window."""
 
 
 class SharedMonitors:
@@ -134,8 +133,7 @@ class SharedMonitors:
                     case Understated():
                         covariance = widened(covariance, finding.second_moment, slot)
                     case Elsewhere():
-                        moved = self._moved(belief.arrival, slot, lag, finding.place, problem, slide=slide)
-                        elsewhere = slot, moved
+                        elsewhere = slot, self._carried_back(slot, lag, finding.place, problem, slide=slide)
                     case _:
                         self._doubtful[slot] = True
         observable &= ~self._doubtful
@@ -189,19 +187,15 @@ class SharedMonitors:
             {other: body_of(mean, covariance, other) for other in others},
         )
 
-    def _moved(
-        self, arrival: InformationState, slot: int, lag: int, there: Body, problem: WindowProblem, *, slide: bool
-    ) -> InformationState:
-        """The arrival cost with a block where the data held to ``lag`` ticks ago, carried back through the window."""
-        mine, own = slice(3 * slot, 3 * slot + 3), block(slot)
+    def _carried_back(self, slot: int, lag: int, there: Body, problem: WindowProblem, *, slide: bool) -> Body:
+        """A place that the data held to ``lag`` ticks ago, at the window's start."""
+        mine = slice(3 * slot, 3 * slot + 3)
         back, push = transition_matrix(1, -self._period_s), input_matrix(1, self._period_s)
         place, spread = there[0], RESEATED_SPREAD * there[1]
         for k in range(len(problem.accel) - 1 - lag, 0 if slide else -1, -1):
             place = back @ (place - push @ problem.accel[k, mine])
             spread = back @ (spread + (push * problem.accel_variance[k, mine]) @ push.T) @ back.T
-        mean = arrival.mean.copy()
-        mean[own] = place
-        return InformationState.from_moments(mean, covering(arrival.covariance(), spread, slot))
+        return place, spread
 
     def change_members(
         self, change: MemberChange, fresh: Mapping[int, Body], limits: StateLimits | None = None

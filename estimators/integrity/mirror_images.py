@@ -49,8 +49,8 @@ def hold_both_sides(mixture: Mixture, places: Matrix, velocities: Matrix) -> Non
 def _add_images(mixture: Mixture, places: Matrix, velocities: Matrix, normal: Vector) -> None:
     """Hold the image of every component at least as likely as the component's own covariance left it."""
     images = mirrored_states(mixture.means, places, velocities)
-    mirror = _mirror(normal)
-    spreads = mirror @ mixture.covariances @ mirror
+    turn = _turn(normal)
+    spreads = turn @ mixture.covariances @ turn
     away = images - mixture.means
     lead_nats = 0.5 * CREDIT * np.einsum("ki,ki->k", away, _solved(mixture.covariances, away))
     wanted = mixture.log_weights - lead_nats
@@ -67,11 +67,16 @@ def _add_images(mixture: Mixture, places: Matrix, velocities: Matrix, normal: Ve
 
 def image_of(mean: Vector, covariance: Matrix, places: Matrix, velocities: Matrix) -> tuple[Vector, Matrix]:
     """The image ``(6,)``, ``(6, 6)`` of one hypothesis; arguments as in `hold_both_sides`."""
-    mirror = _mirror(_normal(places))
-    return mirrored_states(mean[None], places, velocities)[0], mirror @ covariance @ mirror
+    turn = mirror(places)
+    return mirrored_states(mean[None], places, velocities)[0], turn @ covariance @ turn
 
 
-def _mirror(normal: Vector) -> Matrix:
+def mirror(places: Matrix) -> Matrix:
+    """What turns a state ``(6,)`` relative to the centre of bodies at ``places`` ``(m, 3)`` into its image."""
+    return _turn(_normal(places))
+
+
+def _turn(normal: Vector) -> Matrix:
     return np.asarray(np.kron(np.eye(2), np.eye(3) - 2.0 * np.outer(normal, normal)), np.float64)
 
 

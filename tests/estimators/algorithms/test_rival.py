@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimators.algorithms.rival import Passages, Rival, log_likelihood
+from estimators.algorithms.rival import Passages, Rival, log_likelihood, placed
 from estimators.integrity.thresholds import CREDIT
 from estimators.model.layout import Layout, block
 from estimators.model.measurements import RowTable, input_rows, position_rows, range_row
@@ -36,13 +36,19 @@ def rows(*fixed: int, ranged: tuple[int, ...] = (0, 1, 2)) -> RowTable:
 
 
 def test_there_is_a_rival_of_a_drone_that_ranges_alone_hold_near_a_plane() -> None:
-    rival = Passages(4).rival(rows(0, 1, 2), fleet(1.5), [0, 1, 2, 3])
+    rival = Passages(4).rival(rows(0, 1, 2), fleet(1.5, sigma_m=0.75), [0, 1, 2, 3])
     assert rival is not None
     assert rival.slot == BLIND
-    assert rival.lead_nats == pytest.approx(0.5 * CREDIT * (3.0 / 0.5) ** 2, rel=0.01)
+    assert rival.lead_nats == pytest.approx(0.5 * CREDIT * (3.0 / 0.75) ** 2, rel=0.01)
     assert rival.belief.mean[block(BLIND)] == pytest.approx([1.0, 2.0, -1.5, 0.0, 0.0, 0.0])
     # and of the others it holds the same
     np.testing.assert_array_equal(rival.belief.mean[:18], fleet(1.5).mean[:18])
+
+
+def test_an_estimate_that_is_sure_of_its_side_begins_with_a_small_lead_all_the_same() -> None:
+    rival = Passages(4).rival(rows(0, 1, 2), fleet(1.5, sigma_m=0.4), [0, 1, 2, 3])
+    assert rival is not None
+    assert rival.lead_nats == 3.0 < 0.5 * CREDIT * (3.0 / 0.4) ** 2
 
 
 @pytest.mark.parametrize(
@@ -113,9 +119,71 @@ def test_new_rivals_find_their_place_before_they_are_weighed() -> None:
     _, solution = solved(belief, np.zeros((2, 3)))
     rival = Rival(0, belief, None, 1.0)
     for _ in range(10):
-        rival = rival.weighed(3.0, belief, solution)
-    assert rival.lead_nats == 1.0
-    assert rival.weighed(3.0, belief, solution).lead_nats == 4.0
+        rival = rival.weighed(3.0, solution, solution.cost)
+    assert rival.odds_nats == 1.0
+    assert rival.weighed(3.0, solution, solution.cost).odds_nats == 4.0
+
+
+def test_what_is_in_the_window_counts_by_the_optima_and_is_not_summed() -> None:
+    belief = SlowBelief.first(np.zeros(6), np.eye(6), np.zeros(0))
+    _, solution = solved(belief, np.ones((2, 3)))
+    rival = Rival(0, belief, None, 1.0)
+    for _ in range(3):
+        rival = rival.weighed(0.0, solution, solution.cost - 4.0)
+        assert rival.odds_nats == pytest.approx(3.0)
+
+
+def test_a_rival_that_is_far_likelier_leads_once_it_has_found_its_place() -> None:
+    belief = SlowBelief.first(np.zeros(6), np.eye(6), np.zeros(0))
+    _, solution = solved(belief, np.zeros((2, 3)))
+    leads = {}
+    for ahead_nats in (5.0, 7.0):
+        rival, leads[ahead_nats] = Rival(0, belief, None, 0.0), []
+        for _ in range(12):
+            rival = rival.weighed(0.0, solution, solution.cost + 2.0 * ahead_nats)
+            leads[ahead_nats].append(rival.leads)
+    assert leads == {5.0: 12 * [False], 7.0: 10 * [False] + 2 * [True]}
+
+
+def test_the_estimate_that_gave_way_is_the_rival_of_the_other() -> None:
+    belief = SlowBelief.first(np.zeros(6), np.eye(6), np.zeros(0))
+    _, mine = solved(belief, np.zeros((2, 3)))
+    _, other = solved(belief, np.ones((2, 3)))
+    rival = Rival(0, belief, None, -2.0).weighed(0.0, other, other.cost + 4.0)
+    swapped = rival.exchanged(mine)
+    assert swapped.last is mine
+    assert swapped.belief is mine.arrival
+    assert swapped.odds_nats == pytest.approx(4.0)
+    assert swapped.probability == pytest.approx(1.0 - rival.probability)
+    # THEN nothing is claimed that was not before: the other place is covered as it was
+    away = mine.path[-1] - other.path[-1]
+    expected = rival.probability * other.covariance + swapped.probability * (mine.covariance + np.outer(away, away))
+    np.testing.assert_allclose(swapped.covered(other.path, other.covariance), expected, atol=1e-12)
+
+
+def test_an_image_goes_with_what_its_neighbours_share() -> None:
+    # GIVEN places that are known well relative to each other, and badly together
+    rival = Passages(4).rival(rows(0, 1, 2), fleet(1.5, shared_m=20.0), [0, 1, 2, 3])
+    assert rival is not None
+    # THEN so they are with the drone at its image, only less well across the plane
+    away = np.zeros(24)
+    away[20], away[[2, 8, 14]] = 1.0, -1.0 / 3.0
+    found = rival.belief.covariance
+    assert away @ found @ away == pytest.approx(2.0 * 0.5**2, rel=0.01)
+    assert found[20, 20] == pytest.approx(20.0**2, rel=0.01)
+    assert np.linalg.eigvalsh(found).min() > 0.0
+
+
+def test_a_drone_that_is_placed_elsewhere_is_known_relative_to_its_neighbours() -> None:
+    belief = fleet(1.5, shared_m=20.0)
+    there = np.arange(6.0), 0.04 * np.eye(6)
+    found = placed(belief, BLIND, there, [0, 1, 2])
+    np.testing.assert_array_equal(found.mean[block(BLIND)], there[0])
+    np.testing.assert_array_equal(found.covariance[:18, :18], belief.covariance[:18, :18])
+    away = np.zeros(24)
+    away[18], away[[0, 6, 12]] = 1.0, -1.0 / 3.0
+    assert away @ found.covariance @ away == pytest.approx(0.04)
+    assert found.covariance[18, 18] == pytest.approx(400.0, rel=0.01)
 
 
 def test_both_places_are_covered_by_their_probability() -> None:

@@ -18,14 +18,16 @@ from collections.abc import Collection, Mapping, Sequence
 
 import numpy as np
 
-from estimators.algorithms.shared_monitors import Belief, SharedMonitors
+from estimators.algorithms.rival import Passages, Rival, log_likelihood, merged, placed
+from estimators.algorithms.shared_monitors import Belief, SharedMonitors, Verdict
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, SolverReport, Status
-from estimators.integrity.ambiguity import Body, body_of
+from estimators.integrity.ambiguity import Body
 from estimators.integrity.finding import Finding, What
 from estimators.integrity.innovations import InnovationMonitor
+from estimators.integrity.thresholds import DECISIVE_NATS
 from estimators.model.gaussian import Pair, Prior, symmetrised
-from estimators.model.layout import Layout
+from estimators.model.layout import Layout, block
 from estimators.model.limits import state_limits
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.members import InformationState, MemberChange
@@ -82,9 +84,12 @@ class SharedMovingHorizonEstimator:
         """Of the tick before, to start from."""
         self._consensus = Inheritance(slot)
         self._innovations = InnovationMonitor(layout.size, slot, period_s)
+        self._rival: Rival | None = None
+        """The same fleet with a drone at another place, while that is possible."""
+        self._passages = Passages(layout.size)
         self._limits = state_limits(settings, layout.size)
         self._monitors = SharedMonitors(
-            layout, slot, body_of(mean, covariance, slot), period_s, settings.norm_smoothing_m, self._limits
+            layout, slot, mean, covariance, period_s, settings.norm_smoothing_m, self._limits
         )
 
     @property
@@ -132,14 +137,15 @@ class SharedMovingHorizonEstimator:
         pair = self._consensus.pair()
         if pair is not self._own:
             self.belief = self.belief.with_pair(self._own, pair)
-        problem, solution = self._solved(budget)
+        before = self._rival
+        problem, solution, moves = self._compared(*self._solved(self.belief, self._last, budget), budget)
         self._learn(problem, solution)
         contradictions = self._contradictions(problem, solution)
         states = self.belief.states
         covariance = symmetrised(solution.covariance[:states, :states])
         belief = Belief(solution.path, covariance, solution.arrival.kinematic())
         rows, measured = self._seen(problem, solution)
-        verdict = self._monitors.look(rows, measured, belief, slide=self.window.full)
+        verdict = self._monitors.look(rows, measured, belief, (before, self._rival), slide=self.window.full)
         observable = verdict.observable
         for finding in contradictions:
             if finding.what is What.FIXES_CONTRADICT:
@@ -149,43 +155,98 @@ class SharedMovingHorizonEstimator:
         if verdict.moves:
             moved = verdict.belief.arrival
             self.belief, self._states = solution.arrival.with_states(moved.mean, moved.covariance()), moved
-            self._last = None
+            self._last = self._rival = None
+        elif self._rival is None:
+            self._rival = self._other_place(problem, solution, verdict)
         return Estimate(
             self.window.last,
             verdict.belief.path[-1],
             verdict.belief.covariance,
             self._status(solution.converged, len(problem.rows) > 0, bool(observable[self.slot])),
             self.window.ages(),
-            SolverReport(solution.iterations, solution.programs, solution.cost, solution.active, verdict.moves),
+            SolverReport(
+                solution.iterations, solution.programs, solution.cost, solution.active, moves + verdict.moves
+            ),
             observable,
             contradictions,
             self._innovations.averages(),
         )
 
-    def _solved(self, budget: int | None) -> tuple[SlowProblem, SlowSolution]:
-        """The window's problem and its solution, begun where the last one ended."""
+    def _compared(
+        self, problem: SlowProblem, solution: SlowSolution, budget: int | None
+    ) -> tuple[SlowProblem, SlowSolution, int]:
+        """The window and its solution, or those of the rival if it leads now; and how often that happened."""
+        rival = self._rival
+        if rival is None:
+            return problem, solution, 0
+        try:
+            theirs, elsewhere = self._solved(rival.belief, rival.last, budget)
+        except (ArithmeticError, ValueError):  # where the data cannot be explained, the drone is not
+            self._drop_rival(rival)
+            return problem, solution, 0
+        gained_nats = 0.0
+        if self.window.full:
+            gained_nats = log_likelihood(problem, solution, self.belief.covariance)
+            gained_nats -= log_likelihood(theirs, elsewhere, rival.belief.covariance)
+        rival, moves = rival.weighed(gained_nats, elsewhere, solution.cost), 0
+        if rival.leads:
+            rival, problem, solution, moves = rival.exchanged(solution), theirs, elsewhere, 1
+        self._rival = rival
+        if rival.odds_nats > DECISIVE_NATS:
+            self._drop_rival(rival)
+        elif merged(rival, solution):
+            self._rival = None
+        return problem, solution, moves
+
+    def _other_place(self, problem: SlowProblem, solution: SlowSolution, verdict: Verdict) -> Rival | None:
+        """The place that a drone may be at instead: its mirror image, or where its data hold to."""
+        located = np.flatnonzero(verdict.observable).tolist()
+        mirrored = self._passages.rival(problem.rows, solution.arrival, located) if self.window.full else None
+        if mirrored is not None and self._is_possible(mirrored):
+            return mirrored
+        if verdict.elsewhere is None:
+            return None
+        slot, there = verdict.elsewhere
+        bodies = [each for each in located if each != slot]
+        return Rival(slot, placed(solution.arrival, slot, there, bodies), None, 0.0)
+
+    def _is_possible(self, rival: Rival) -> bool:
+        """Whether a rival's drone is where it may be."""
+        at = block(rival.slot)
+        mean, spread = rival.belief.mean[None, at], rival.belief.covariance[None, at, at]
+        return self._limits is None or bool(self._limits.allow(rival.slot, mean, spread).all())
+
+    def _drop_rival(self, rival: Rival) -> None:
+        """Go on with one place, which is decided upon."""
+        self._passages.settle(rival.slot)
+        self._rival = None
+
+    def _solved(
+        self, belief: SlowBelief, last: SlowSolution | None, budget: int | None
+    ) -> tuple[SlowProblem, SlowSolution]:
+        """The window's problem with a belief about its start, and its solution, begun where the last one ended."""
         settings = self.settings
         white = np.ones((self.layout.size, 3))
         if self._sizes is not None:
-            self.belief, white = self.belief.resized(self._present_sizes()), self._sizes.white_factors()
+            belief, white = belief.resized(self._present_sizes()), self._sizes.white_factors()
         problem = slow_problem(
             self.window,
-            self.belief,
+            belief,
             white,
             self.period_s,
             settings.norm_smoothing_m,
             robust=settings.robust,
             ignored=self._innovations.ignored,
         )
-        path, slow = self.belief.mean[None, : self.belief.states], self.belief.mean[self.belief.states :]
-        if self._last is not None:
-            slid = len(self._last.path) - len(problem.window.accel)
-            path, slow = self._last.path[slid:], self._last.slow
+        path, slow = belief.mean[None, : belief.states], belief.mean[belief.states :]
+        if last is not None:
+            slid = len(last.path) - len(problem.window.accel)
+            path, slow = last.path[slid:], last.slow
         guess = continued(path, problem, slow), slow
         limit = settings.max_iterations if budget is None else min(budget, settings.max_iterations)
         bounds = None if self._limits is None else (self._limits, make_engine(settings.qp))
         return problem, solve_limited(
-            problem, self.belief, guess, limit, settings.tolerance, bounds, slide=self.window.full
+            problem, belief, guess, limit, settings.tolerance, bounds, slide=self.window.full
         )
 
     def _learn(self, problem: SlowProblem, solution: SlowSolution) -> None:
@@ -238,21 +299,21 @@ class SharedMovingHorizonEstimator:
         if self._sizes is not None:
             self._sizes.change_members(change)
         self.belief = self.belief.reindexed(change, self._present_sizes())
-        self._states = self._last = None
+        self._states = self._last = self._rival = None
+        self._passages.forget(change.after.size)
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)
         self._consensus.change_members(change)
         self._innovations.change_members(change)
-        prior = change.fresh.get(self.slot)
+        began = {each: self._at_last_tick(each, prior) for each, prior in change.fresh.items()}
         self._limits = state_limits(self.settings, self.layout.size)
-        restart = None if prior is None else self._at_last_tick(prior)
-        self._monitors.change_members(change, restart, self._limits)
+        self._monitors.change_members(change, began, self._limits)
 
-    def _at_last_tick(self, prior: Prior) -> Body:
-        """A prior of the own state, of `prior_tick`, brought to the window's last tick."""
+    def _at_last_tick(self, slot: int, prior: Prior) -> Body:
+        """A prior of a state, of `prior_tick`, brought to the window's last tick."""
         mean, covariance = prior
         move, push = transition_matrix(1, self.period_s), input_matrix(1, self.period_s)
-        mine = slice(3 * self.slot, 3 * self.slot + 3)
+        mine = slice(3 * slot, 3 * slot + 3)
         accel, variance = self.window.inputs()
         for k in range(self.prior_tick - self.window.first, len(accel)):
             mean = move @ mean + push @ accel[k, mine]

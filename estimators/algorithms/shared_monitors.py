@@ -1,42 +1,47 @@
 """What watches over the shared estimator: which places the data tell, and whether they allow another one.
 
-Three monitors look at every solved window: what the data alone say (`estimators.integrity.data_observability`), the
-mirror image of the whole fleet (`estimators.integrity.fleet_mirror`), and, for a drone without fixes, other places of
-its own (`estimators.integrity.ambiguity`). Here is what follows from what they find: a wider covariance, agents that
-are not observable, or a belief moved to the only place that the data allow.
+Monitors look at every solved window: what the data alone say (`estimators.integrity.data_observability`), the mirror
+image of the whole fleet (`estimators.integrity.fleet_mirror`), and, of every drone without fixes, other places
+(`estimators.integrity.ambiguity`): what an agent believes of a blind drone is to be as honest as its own word. Here
+is what follows from what they find: a wider covariance, agents that are not observable, another place to be weighed
+against the estimate's (`estimators.algorithms.rival`), or a fleet mirrored.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from estimators.algorithms.rival import Rival
 from estimators.integrity.ambiguity import (
     AmbiguityMonitor,
     Body,
+    DroneEvidence,
     Elsewhere,
-    OwnEvidence,
     Understated,
     body_of,
-    own_rows,
+    rows_of,
 )
 from estimators.integrity.data_observability import ObservabilityMonitor
 from estimators.integrity.finding import What, has
 from estimators.integrity.fleet_mirror import FleetMirrorMonitor, MirrorImage, mirror_offset, mirrored
+from estimators.integrity.thresholds import FLOOR_M, UNDERSTATED
 from estimators.integrity.window_evidence import WindowEvidence
-from estimators.model.gaussian import covering
 from estimators.model.layout import STATES_PER_AGENT, Layout, block
 from estimators.model.limits import StateLimits
-from estimators.model.measurements import Matrix, RowTable, empty_rows
+from estimators.model.measurements import Matrix, RowTable, Vector, empty_rows
 from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import POSITION, any_of
 from estimators.window.problem import WindowProblem
 
 RESEATED_SPREAD = 2.0
-"""Factor on the covariance of a place that the own data hold to: the window's rows are in it already."""
+"""Factor on the covariance of a place that the data hold to: the window's rows are in it already."""
+HEARSAY_TICKS = 2
+"""What another drone measured is looked at so much later than the own: packets may be late."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,16 +65,19 @@ class Verdict:
     """``(n,)`` whose place the data tell."""
     moves: int
     """How often the belief was moved to where the data hold."""
+    elsewhere: tuple[int, Body] | None = None
+    """A drone whose data hold to another place, and its state there at the first tick of the next window."""
 
 
 class SharedMonitors:
-    """The monitors of one agent; ``own`` is its state at the first tick."""
+    """The monitors of one agent; ``mean`` and ``covariance`` are the fleet's state at the first tick."""
 
     def __init__(
         self,
         layout: Layout,
         slot: int,
-        own: Body,
+        mean: Vector,
+        covariance: Matrix,
         period_s: float,
         norm_smoothing: float,
         limits: StateLimits | None = None,
@@ -79,10 +87,26 @@ class SharedMonitors:
         self._norm_smoothing = norm_smoothing
         self._observability = ObservabilityMonitor(layout.size)
         self._mirror = FleetMirrorMonitor()
-        self._ambiguity = AmbiguityMonitor(slot, own, period_s, limits)
+        self._ambiguities = [
+            AmbiguityMonitor(each, body_of(mean, covariance, each), period_s, limits) for each in range(layout.size)
+        ]
+        """By slot."""
+        self._doubtful = np.zeros(layout.size, np.bool_)
+        """``(n,)``: in the last tick, by these."""
 
-    def look(self, problem: WindowProblem, measured: RowTable, belief: Belief, *, slide: bool) -> Verdict:
+    def look(
+        self,
+        problem: WindowProblem,
+        measured: RowTable,
+        belief: Belief,
+        rivals: tuple[Rival | None, Rival | None],
+        *,
+        slide: bool,
+    ) -> Verdict:
         """Weigh a solved window; ``measured`` are its rows with the sensors' own variances.
+
+        ``rivals``: that of the tick before, and the one that is left of it. A drone that has one is left to it: it
+        weighs two places with all that the estimator holds.
 
         ``slide``: whether the arrival cost is that of a window that starts one tick later.
         """
@@ -93,20 +117,35 @@ class SharedMonitors:
         mirror, moves = self._mirror.observe(window), 0
         if has(mirror, What.REVERSED):
             belief, moves = _reversed(belief), 1
-        covariance, arrival = belief.covariance, belief.arrival
-        for finding in self._ambiguity.observe(self._own(problem, measured, belief, observable)):
-            match finding:
-                case Understated():
-                    covariance = covering(covariance, finding.second_moment, self._slot)
-                case Elsewhere():
-                    arrival, moves = self._moved(arrival, finding.place, problem, slide=slide), moves + 1
-                case _:
-                    observable[self._slot] = False
+        covariance, elsewhere = belief.covariance, None
+        before, rival = rivals
+        located = observable & ~self._doubtful
+        self._doubtful = np.zeros(len(observable), np.bool_)
+        for slot, monitor in enumerate(self._ambiguities):
+            lag = 0 if slot == self._slot else HEARSAY_TICKS
+            if lag >= len(problem.accel):
+                continue
+            if before is not None and before.slot == slot:
+                monitor.restart(body_of(belief.path[-1 - lag], belief.covariance, slot))
+                continue
+            for finding in monitor.observe(self._evidence(slot, lag, problem, measured, belief, located)):
+                match finding:
+                    case Understated():
+                        covariance = widened(covariance, finding.second_moment, slot)
+                    case Elsewhere():
+                        elsewhere = slot, self._carried_back(slot, lag, finding.place, problem, slide=slide)
+                    case _:
+                        self._doubtful[slot] = True
+        observable &= ~self._doubtful
+        if rival is not None:
+            covered = rival.covered(belief.path, covariance)
+            observable &= ~understated(covered, covariance)
+            covariance = covered
         for finding in mirror:
             if isinstance(finding, MirrorImage):
                 observable &= ~finding.doubtful(covariance)
                 covariance = finding.covered(covariance)
-        return Verdict(Belief(belief.path, covariance, arrival), observable, moves)
+        return Verdict(replace(belief, covariance=covariance), observable, moves, elsewhere)
 
     def _window(self, problem: WindowProblem, belief: Belief, *, slide: bool) -> WindowEvidence:
         """What the monitors of the whole fleet look at."""
@@ -122,46 +161,76 @@ class SharedMonitors:
             self._norm_smoothing,
         )
 
-    def _own(
-        self, problem: WindowProblem, measured: RowTable, belief: Belief, observable: NDArray[np.bool_]
-    ) -> OwnEvidence:
-        """What speaks of the own state at the newest tick; the others are where the estimate has them."""
-        slot, mean, covariance = self._slot, belief.path[-1], belief.covariance
+    def _evidence(
+        self,
+        slot: int,
+        lag: int,
+        problem: WindowProblem,
+        measured: RowTable,
+        belief: Belief,
+        located: NDArray[np.bool_],
+    ) -> DroneEvidence:
+        """What speaks of a drone ``lag`` ticks ago; the others are where the estimate has them."""
+        mean, covariance = belief.path[-1 - lag], belief.covariance
         fixed = any_of(problem.rows, POSITION, slot)
         mine = slice(3 * slot, 3 * slot + 3)
-        located = [] if fixed else [int(s) for s in np.flatnonzero(observable) if s != slot]
-        return OwnEvidence(
+        start = problem.start
+        rows = empty_rows() if fixed else rows_of(measured[start[-2 - lag] : start[-1 - lag]], slot)
+        others = [] if fixed else [int(s) for s in np.flatnonzero(located) if s != slot]
+        return DroneEvidence(
             fixed,
+            slot == self._slot or bool((problem.rows["observer"] == slot).any()),
             body_of(mean, covariance, slot),
-            empty_rows() if fixed else own_rows(measured[problem.start[-2] :], slot),
-            problem.accel[-1, mine],
-            problem.accel_variance[-1, mine],
-            {other: body_of(mean, covariance, other) for other in located},
+            rows,
+            problem.accel[-1 - lag, mine],
+            problem.accel_variance[-1 - lag, mine],
+            {other: body_of(mean, covariance, other) for other in others},
         )
 
-    def _moved(
-        self, arrival: InformationState, there: Body, problem: WindowProblem, *, slide: bool
-    ) -> InformationState:
-        """The arrival cost with its own block where its data hold to, carried back through the window."""
-        mine, own = slice(3 * self._slot, 3 * self._slot + 3), block(self._slot)
+    def _carried_back(self, slot: int, lag: int, there: Body, problem: WindowProblem, *, slide: bool) -> Body:
+        """A place that the data held to ``lag`` ticks ago, at the window's start."""
+        mine = slice(3 * slot, 3 * slot + 3)
         back, push = transition_matrix(1, -self._period_s), input_matrix(1, self._period_s)
         place, spread = there[0], RESEATED_SPREAD * there[1]
-        for k in range(len(problem.accel) - 1, 0 if slide else -1, -1):
+        for k in range(len(problem.accel) - 1 - lag, 0 if slide else -1, -1):
             place = back @ (place - push @ problem.accel[k, mine])
             spread = back @ (spread + (push * problem.accel_variance[k, mine]) @ push.T) @ back.T
-        mean = arrival.mean.copy()
-        mean[own] = place
-        return InformationState.from_moments(mean, covering(arrival.covariance(), spread, self._slot))
+        return place, spread
 
     def change_members(
-        self, change: MemberChange, restart: Body | None, limits: StateLimits | None = None
+        self, change: MemberChange, fresh: Mapping[int, Body], limits: StateLimits | None = None
     ) -> None:
-        """Go on with another fleet, its limits; ``restart``: the own state at the last tick, where it begins anew."""
+        """Go on with another fleet, its limits; ``fresh``: the states, at the last tick, of those that begin anew."""
         self._slot = change.own
         self._observability.change_members(change)
-        self._ambiguity.change_members(change, limits)
-        if restart is not None:
-            self._ambiguity = AmbiguityMonitor(change.own, restart, self._period_s, limits)
+        monitors = []
+        for slot in range(change.after.size):
+            if slot in fresh:
+                monitors.append(AmbiguityMonitor(slot, fresh[slot], self._period_s, limits))
+            else:
+                monitors.append(self._ambiguities[change.stayed[slot]])
+                monitors[-1].change_members(change, limits)
+        self._doubtful = np.array([s not in fresh and self._doubtful[change.stayed[s]] for s in range(len(monitors))])
+        self._ambiguities = monitors
+
+
+def widened(covariance: Matrix, moment: Matrix, slot: int) -> Matrix:
+    """A covariance ``(6n, 6n)`` whose block of an agent is at least ``moment`` ``(6, 6)`` along every direction.
+
+    Only what is missing is added: the errors that the agent shares with the others stay shared.
+    """
+    out, own = covariance.copy(), block(slot)
+    values, axes = np.linalg.eigh(moment - covariance[own, own])
+    out[own, own] += (axes * np.maximum(values, 0.0)) @ axes.T
+    return out
+
+
+def understated(covered: Matrix, covariance: Matrix) -> NDArray[np.bool_]:
+    """Of which agents ``(n,)`` a covariance ``(6n, 6n)`` is not to be trusted, given what it should be."""
+    expected, claimed = (
+        each.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3].sum(-1) for each in (covered, covariance)
+    )
+    return np.asarray(expected > np.maximum(FLOOR_M**2, UNDERSTATED * claimed))
 
 
 def _reversed(belief: Belief) -> Belief:

@@ -1,9 +1,13 @@
 """Where else may a drone without fixes be: does the estimate hold the only place that the data allow?
 
 The estimator linearises its ranges at one place. Started from a wrong one it may settle in a mirror image, and
-its covariance knows nothing of the other. This monitor follows the own state from the own rows alone as a Gaussian
+its covariance knows nothing of the other. This monitor follows the drone's state from its rows alone as a Gaussian
 mixture (`estimators.integrity.hypotheses`), with the neighbours where the estimate has them, and says how wrong the
 estimate may be. It sleeps while the drone has fixes.
+
+The estimate is one hypothesis among the others, and so are the mirror images in the plane of the bodies ranged to
+(`estimators.integrity.mirror_images`): all are corrected with the same rows in the same way, and the doubt between
+two ends when the odds between them are decisive. Every agent runs a monitor for every drone whose records it holds.
 """
 
 from __future__ import annotations
@@ -13,6 +17,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.hypotheses import (
@@ -25,6 +30,7 @@ from estimators.integrity.hypotheses import (
     reduce,
     split,
 )
+from estimators.integrity.mirror_images import hold_both_sides, image_of
 from estimators.integrity.range_geometry import directions, spread
 from estimators.integrity.thresholds import (
     BLIND_TICKS,
@@ -56,13 +62,15 @@ Body = tuple[Vector, Matrix]
 
 
 @dataclass(frozen=True, slots=True)
-class OwnEvidence:
-    """What speaks of the own state in a tick."""
+class DroneEvidence:
+    """What speaks of one drone's state in a tick."""
 
     fixed: bool
     """Whether the estimator's window holds a fix of this drone: then the rest is not looked at."""
+    heard: bool
+    """Whether the window holds anything that this drone measured: one never heard is not known to be blind."""
     estimate: Body
-    """The own state at this tick."""
+    """Its state at this tick."""
     rows: RowTable
     """The tick's rows that name this drone."""
     accel: Vector
@@ -102,14 +110,14 @@ class _Ranged(NamedTuple):
 
 
 class AmbiguityMonitor:
-    """Follows one agent's own state; ``prior`` is its state before the first tick that is looked at."""
+    """Follows the drone in ``slot``; ``prior`` is its state before the first tick that is looked at."""
 
     def __init__(self, slot: int, prior: Body, period_s: float, limits: StateLimits | None = None) -> None:
         self._slot = slot
         self._period_s = period_s
         self._limits = limits
-        self._mixture: Mixture | None = Mixture.single(*prior)
-        """None while the drone has fixes."""
+        self._mixture: Mixture | None = None
+        """None while the drone has fixes, and before it is heard."""
         self._estimate = prior
         """As of the last tick."""
         self._blind_ticks = BLIND_TICKS
@@ -117,27 +125,30 @@ class AmbiguityMonitor:
         self._places: dict[tuple[float, ...] | int, tuple[int, Vector]] = {}
         """Located bodies that ranges went to lately (slot, or an anchor's place): when, and where they were."""
         self._settled_ticks = 0
-        self._foretold = Mixture.single(*prior)
-        """The estimate of the last tick, moved to this one, with its rows other than ranges."""
-        self._lead_nats = 0.0
-        """How much better than the estimate the hypotheses foretold what was measured, while they are apart."""
 
-    def observe(self, evidence: OwnEvidence) -> tuple[Finding, ...]:
+    def observe(self, evidence: DroneEvidence) -> tuple[Finding, ...]:
         """Whether the place is ambiguous, the covariance too small (`Understated`), the drone `Elsewhere`."""
         before, self._estimate = self._estimate, evidence.estimate
         self._tick += 1
+        if not evidence.fixed and not evidence.heard and self._mixture is None:
+            return ()
         self._blind_ticks = 0 if evidence.fixed else self._blind_ticks + 1
         if self._blind_ticks < BLIND_TICKS:
             self._mixture = None
             return ()
-        if self._mixture is None:
-            self._mixture = Mixture.single(*before)
-        self._foretold = Mixture.single(*before)
-        self._advance(self._mixture, evidence)
-        mixture = self._mixture = self._corrected(self._mixture, evidence)
+        mixture = Mixture.single(*before) if self._mixture is None else self._mixture
+        self._advance(mixture, evidence)
+        mixture = self._corrected(mixture, evidence)
         if not is_sound(mixture) or not self._is_possible(mixture):
-            mixture = self._mixture = Mixture.single(*evidence.estimate)
-        return self._judged(mixture, evidence.estimate)
+            mixture = Mixture.single(*evidence.estimate)
+        self._mixture = mixture
+        return self._judged(mixture, evidence)
+
+    def restart(self, estimate: Body) -> None:
+        """Go on from an estimate of this tick, whose other places somebody else holds."""
+        self._estimate, self._mixture = estimate, Mixture.single(*estimate)
+        self._tick += 1
+        self._settled_ticks = SETTLED_TICKS + 1
 
     def _is_possible(self, mixture: Mixture) -> bool:
         """Give up hypotheses that are beyond the limits; False where none is left."""
@@ -150,22 +161,24 @@ class AmbiguityMonitor:
         return bool(allowed.any())
 
     def change_members(self, change: MemberChange, limits: StateLimits | None = None) -> None:
-        """Go on with another fleet, its limits; who left or begins anew is no longer a body that ranges went to."""
-        self._slot, self._limits = change.own, limits
+        """Go on with another fleet, its limits, of which the drone is still a part.
+
+        Who left or begins anew is no longer a body that ranges went to.
+        """
         stayed = {before: slot for slot, before in change.stayed.items()}
+        self._slot, self._limits = stayed[self._slot], limits
         kept = {key: seen for key, seen in self._places.items() if not isinstance(key, int) or key in stayed}
         self._places = {stayed[key] if isinstance(key, int) else key: seen for key, seen in kept.items()}
 
-    def _advance(self, mixture: Mixture, evidence: OwnEvidence) -> None:
+    def _advance(self, mixture: Mixture, evidence: DroneEvidence) -> None:
         """Move to this tick and use its rows other than ranges."""
         rows = evidence.rows
         linear = rows[(rows["kind"] == Kind.POSITION) | (rows["kind"] == Kind.VELOCITY)]
-        for each in (mixture, self._foretold):  # both, or the ranges are weighed against an older guess
-            predict(each, evidence.accel, evidence.accel_variance, self._period_s)
-            for row in linear[np.argsort(linear["value"], kind="stable")]:
-                correct_linear(each, _slope(row), float(row["value"]), float(row["variance"]))
+        predict(mixture, evidence.accel, evidence.accel_variance, self._period_s)
+        for row in linear[np.argsort(linear["value"], kind="stable")]:
+            correct_linear(mixture, _slope(row), float(row["value"]), float(row["variance"]))
 
-    def _corrected(self, mixture: Mixture, evidence: OwnEvidence) -> Mixture:
+    def _corrected(self, mixture: Mixture, evidence: DroneEvidence) -> Mixture:
         """Use the ranges of the tick, nearest first, to the bodies that are located and to anchors."""
         usable = sorted(self._usable(evidence.rows, evidence.others), key=lambda each: each.range_m)
         for each in usable:
@@ -177,38 +190,24 @@ class AmbiguityMonitor:
         nearest = usable[0]
         others = [each.place[:3] - nearest.place[:3] for each in usable if each.target != nearest.target]
         forward = others[0] if others else mixture.means[0, 3:]
-        self._compare(mixture, usable)
         if len(mixture.log_weights) == 1 and _sigma(mixture.covariances[0]) > SCATTERED_FRACTION * nearest.range_m:
             mixture = _scattered(mixture, nearest, forward)
             usable = usable[1:]
         sigma_m = float(np.sqrt(nearest.variance + _sigma(nearest.spread) ** 2))
         split(mixture, nearest.place[:3], float(np.sqrt(2.0 * SAGITTA * nearest.range_m * sigma_m)), forward)
-        _use(mixture, usable)
-        reduce(mixture)
+        for each in usable:
+            correct_range(mixture, each.place, each.spread, each.range_m, each.variance, each.offset_s)
         return mixture
 
-    def _compare(self, mixture: Mixture, ranges: Sequence[_Ranged]) -> None:
-        """Weigh the ranges about to be used: how much better the hypotheses foretell them than the estimate."""
-        ours, theirs = mixture.copy(), self._foretold.copy()
-        known_nats = ours.evidence - theirs.evidence  # of the rows that both have used
-        _use(ours, ranges)
-        _use(theirs, ranges)
-        gained = self._lead_nats + ours.evidence - theirs.evidence - known_nats
-        self._lead_nats = float(np.clip(gained, -2.0 * DECISIVE_NATS, 2.0 * DECISIVE_NATS))
-
-    def _judged(self, mixture: Mixture, estimate: Body) -> tuple[Finding, ...]:
-        """Compare with the estimate of this tick; where it has won, the hypotheses begin anew from it."""
-        mean, covariance = estimate
-        elsewhere: Body | None = None
-        weight, there, spread_there = mixture.likeliest()
-        if not _apart((there, spread_there), estimate):
-            self._lead_nats = 0.0
-        elif self._lead_nats < -DECISIVE_NATS:
-            mixture = self._mixture = Mixture.single(*estimate)
-            self._lead_nats = 0.0
-        elif self._lead_nats > DECISIVE_NATS and weight > CERTAIN:
-            elsewhere = there.copy(), spread_there.copy()
-            self._lead_nats = 0.0
+    def _judged(self, mixture: Mixture, evidence: DroneEvidence) -> tuple[Finding, ...]:
+        """Compare with the estimate of this tick, which is one of the hypotheses."""
+        mean, covariance = estimate = evidence.estimate
+        bodies = self._bodies(evidence.others)
+        elsewhere = _decided(mixture, estimate, bodies)
+        reduce(mixture)
+        hold_both_sides(mixture, *bodies)
+        self._is_possible(mixture)  # an image may be beyond the limits
+        _, there, _ = mixture.likeliest()
         moment = mixture.second_moment(mean)
         expected, claimed = float(np.trace(moment[:3, :3])), float(np.trace(covariance[:3, :3]))
         figures = (self._slot, float(np.sqrt(expected)), float(np.sqrt(claimed)))
@@ -228,6 +227,17 @@ class AmbiguityMonitor:
         self._settled_ticks = 0 if doubtful or weak else self._settled_ticks + 1
         unsettled = len(self._places) < DIRECTIONS and self._settled_ticks <= SETTLED_TICKS
         return doubtful or weak or unsettled
+
+    def _bodies(self, others: Mapping[int, Body]) -> tuple[Matrix, Matrix]:
+        """Where the bodies are that ranges went to lately, and how they move: positions, velocities ``(m, 3)``."""
+        states: list[Vector] = []
+        for key, (_, place) in self._places.items():
+            if not isinstance(key, int):
+                states.append(np.concatenate([place, np.zeros(3)]))
+            elif key in others:
+                states.append(others[key][0])
+        bodies = np.array(states).reshape(-1, 6)
+        return bodies[:, :3], bodies[:, 3:]
 
     def _usable(self, rows: RowTable, bodies: Mapping[int, Body]) -> Iterator[_Ranged]:
         """The ranges among ``rows`` whose other end is where it is known to be."""
@@ -251,11 +261,6 @@ def _scattered(mixture: Mixture, nearest: _Ranged, forward: Vector) -> Mixture:
     return on_sphere(mixture.means[0], mixture.covariances[0], centre, nearest.range_m, variance, forward)
 
 
-def _use(mixture: Mixture, ranges: Sequence[_Ranged]) -> None:
-    for each in ranges:
-        correct_range(mixture, each.place, each.spread, each.range_m, each.variance, each.offset_s)
-
-
 def determined(position_m: Vector, places: Sequence[Vector]) -> bool:
     """Whether ranges to ``places`` ``(3,)`` fix a position about ``position_m``, but for its mirror image.
 
@@ -266,13 +271,39 @@ def determined(position_m: Vector, places: Sequence[Vector]) -> bool:
     return bool(spread(directions(position_m, np.array(places)))[0] > FLAT_SPREAD)
 
 
-def _apart(one: Body, other: Body) -> bool:
-    """Whether two estimates of a position cannot both be right."""
-    away = (one[0] - other[0])[:3]
-    return float(away @ np.linalg.solve((one[1] + other[1])[:3, :3], away)) > DISAGREEMENT_SQUARE
+def _decided(mixture: Mixture, estimate: Body, bodies: tuple[Matrix, Matrix]) -> Body | None:
+    """The place that the data hold to against the estimate; a mixture that lacks the estimate's place gets it.
+
+    It is as likely then as the others together: what is measured from then on decides, and of both in the same way.
+    Where the estimate is a mirror image in the plane of ``bodies``, the image is added: it is as sure as what it
+    mirrors, and neither side loses for knowing less of what cannot tell them apart.
+    """
+    here = ~_apart(mixture, estimate)
+    all_nats, top = np.logaddexp.reduce(mixture.log_weights), float(mixture.log_weights.max())
+    weight, place, spread = mixture.likeliest()
+    if not here.any():
+        image = image_of(place, spread, *bodies) if len(bodies[0]) >= DIRECTIONS else estimate
+        mirrored = not _apart(Mixture.single(*image), estimate).any()
+        mixture.add(float(all_nats), *(image if mirrored else estimate))
+        return None
+    if np.logaddexp.reduce(mixture.log_weights[here]) > all_nats - DECISIVE_NATS:
+        return None
+    if weight <= CERTAIN:  # which of the others is not decided: the estimate stays among them
+        mixture.log_weights[here] = np.maximum(mixture.log_weights[here], top - DECISIVE_NATS)
+        return None
+    mixture.log_weights[here] = -np.inf
+    return place.copy(), spread.copy()
 
 
-def own_rows(rows: RowTable, slot: int) -> RowTable:
+def _apart(mixture: Mixture, estimate: Body) -> NDArray[np.bool_]:
+    """Which components ``(K,)`` and an estimate of the position cannot both be right."""
+    away = (mixture.means - estimate[0])[:, :3]
+    both = (mixture.covariances + estimate[1])[:, :3, :3]
+    square = np.einsum("ki,ki->k", away, np.linalg.solve(both, away[:, :, None])[:, :, 0])
+    return np.asarray(square > DISAGREEMENT_SQUARE)
+
+
+def rows_of(rows: RowTable, slot: int) -> RowTable:
     """Rows that speak of an agent: its own and ranges to it."""
     return np.asarray(rows[(rows["agent"] == slot) | (rows["other"] == slot)])
 

@@ -23,6 +23,7 @@ from estimators.compiled.entries import entry
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.thresholds import (
     CERTAIN_NATS,
+    CREDIT,
     DECISIVE_NATS,
     FEWEST_MIRRORED,
     FLOOR_M,
@@ -35,9 +36,6 @@ from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.row_kernels import ANCHOR_RANGE, POSITION, PRECISION, VALUE, IntArray, encode_rows, predict_row
 
-CREDIT = 0.25
-"""Share of an estimate's information that is believed where a fleet is nearly plane: ranges in a plane tell of what
-is across it in the second order only, and a linearisation takes that for more."""
 TURN_RAD = 0.3
 """1-sigma about each axis by which a fleet that was taken for its mirror image is turned, to fit the fixes better."""
 

@@ -17,8 +17,9 @@ from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import IntArray
 
-PRUNED_NATS = 12.0
-"""Components less likely than the likeliest by more than this (a factor of 1.6e5) are given up."""
+PRUNED_NATS = 14.0
+"""Components less likely than the likeliest by more than this (a factor of 1.2e6) are given up; what decides between
+two places (`estimators.integrity.thresholds.DECISIVE_NATS`) is less, so that nothing dies undecided."""
 MERGED_SQUARE = 2.0
 """Squared Mahalanobis distance over the six states below which two components say the same; the parts of a split
 are 9 apart."""
@@ -50,11 +51,11 @@ class Mixture:
         """One that can be changed without this one."""
         return Mixture(self.log_weights.copy(), self.means.copy(), self.covariances.copy())
 
-    @property
-    def evidence(self) -> float:
-        """Logarithm of the sum of the weights: of the likelihood of the data since they summed to one."""
-        top = float(self.log_weights.max())
-        return top + float(np.log(np.exp(self.log_weights - top).sum()))
+    def add(self, log_weight: float, mean: Vector, covariance: Matrix) -> None:
+        """One more component; the weights of the others stay as they are."""
+        self.log_weights = np.append(self.log_weights, log_weight)
+        self.means = np.concatenate([self.means, mean[None]])
+        self.covariances = np.concatenate([self.covariances, covariance[None]])
 
     @property
     def weights(self) -> Vector:
@@ -223,10 +224,10 @@ def split(mixture: Mixture, centre: Vector, widest_m: float, forward: Vector) ->
         wide = wide[np.argsort(-mixture.log_weights[wide], kind="stable")][: (MOST - len(values)) // 2]
         if not len(wide):
             return
-        _cut(mixture, wide, axis[wide])
+        cut(mixture, wide, axis[wide])
 
 
-def _cut(mixture: Mixture, which: IntArray, axis: Matrix) -> None:
+def cut(mixture: Mixture, which: IntArray, axis: Matrix) -> None:
     """Cut the components ``which`` along the directions ``axis`` ``(len(which), 3)`` of their positions."""
     chosen = mixture.covariances[which]
     shift = np.einsum("kij,kj->ki", chosen[:, :, :3], axis)

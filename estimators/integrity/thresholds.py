@@ -75,6 +75,9 @@ DISAGREEMENT_SQUARE = 25.0
 """Squared Mahalanobis distance in position from which on the estimate is at another place: five sigma."""
 DECISIVE_NATS = 12.0
 """Difference of the log likelihoods of two places that decides between them: odds of 160 000."""
+CREDIT = 0.25
+"""Share of a Gaussian's information that is believed of the side of a plane: ranges in a plane tell of what is across
+it in the second order only, and a linearisation takes that for more."""
 SURE_NATS = 9.0
 """Evidence from which on the mirror image, with a probability of 1e-4, is left out of the covariance."""
 CERTAIN_NATS = 24.0

@@ -51,10 +51,13 @@ def marginal_of_states(pair: Pair, kept: NDArray[np.int64], others: NDArray[np.i
     return symmetrised(marginal), np.asarray(right)
 
 
-def covering(covariance: Matrix, own: Matrix, slot: int) -> Matrix:
-    """The fleet's covariance with another one of an agent's state ``(6, 6)``, uncorrelated with the others."""
-    out = covariance.copy()
-    out[block(slot), :] = 0.0
-    out[:, block(slot)] = 0.0
-    out[block(slot), block(slot)] = own
+def reseated(covariance: Matrix, slot: int, onto: Matrix, excess: Matrix) -> Matrix:
+    """The covariance where an agent's state is ``onto`` ``(6, D)`` times the old variables, with an error of its own.
+
+    ``excess`` ``(6, 6)`` is that error's covariance.
+    """
+    out, own = covariance.copy(), block(slot)
+    shared = onto @ covariance
+    out[own, :], out[:, own] = shared, shared.T
+    out[own, own] = shared @ onto.T + excess
     return symmetrised(out)

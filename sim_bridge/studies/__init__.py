@@ -1,1 +1,1 @@
-"""Studies over tick-level recordings: scenario, links, the exchange, the genie, Monte Carlo."""
+"""Studies over tick-level recordings: scenario, passages of a plane, links, the exchange, the genie, Monte Carlo."""

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from estimators.integrity.ambiguity import AmbiguityMonitor, Body, Elsewhere, OwnEvidence, Understated, determined
+from estimators.integrity.ambiguity import AmbiguityMonitor, Body, DroneEvidence, Elsewhere, Understated, determined
 from estimators.integrity.finding import Finding, Gravity, What, has
 from estimators.integrity.hypotheses import Mixture, correct_linear, correct_range, predict
 from estimators.integrity.thresholds import BLIND_TICKS
@@ -42,13 +42,13 @@ def ranges(
 
 def blind(
     estimate: Body, rows: RowTable, others: Mapping[int, Body] | None = None, accel: np.ndarray = REST
-) -> OwnEvidence:
+) -> DroneEvidence:
     """A tick without a fix."""
-    return OwnEvidence(False, estimate, rows, accel, QUIET, {} if others is None else others)
+    return DroneEvidence(False, True, estimate, rows, accel, QUIET, {} if others is None else others)
 
 
-def fixed(estimate: Body) -> OwnEvidence:
-    return OwnEvidence(True, estimate, position_rows(1, 0, estimate[0][:3], np.ones(3)), REST, QUIET, {})
+def fixed(estimate: Body) -> DroneEvidence:
+    return DroneEvidence(True, True, estimate, position_rows(1, 0, estimate[0][:3], np.ones(3)), REST, QUIET, {})
 
 
 def place_of(found: tuple[Finding, ...]) -> Body | None:
@@ -150,7 +150,7 @@ def test_a_measured_velocity_does_not_tilt_the_scales(
             covariance[3:], covariance[:, 3:] = 0.0, 0.0
             covariance[3:, 3:] = speed_variance * np.eye(3)
         rows = np.concatenate((measured, velocity_rows(tick, 0, REST, np.full(3, variance))))
-        found = monitor.observe(OwnEvidence(False, (mean, covariance), rows, REST, noise, bodies(TRIANGLE)))
+        found = monitor.observe(DroneEvidence(False, True, (mean, covariance), rows, REST, noise, bodies(TRIANGLE)))
         # THEN however many velocities are used, neither side foretells the ranges better: none of the two wins
         assert place_of(found) is None
         assert has(found, What.AMBIGUOUS)

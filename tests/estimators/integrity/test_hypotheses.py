@@ -69,8 +69,8 @@ def test_one_component_is_a_kalman_filter() -> None:
     innovation = value - slope @ mean
     assert mixture.means[0] == pytest.approx(mean + gain * innovation)
     assert mixture.covariances[0] == pytest.approx(covariance - np.outer(gain, slope) @ covariance)
-    # THEN the evidence is the density of the datum, up to a constant
-    assert mixture.evidence == pytest.approx(-0.5 * (innovation**2 / total + np.log(total)))
+    # THEN the weight is the density of the datum, up to a constant
+    assert mixture.log_weights[0] == pytest.approx(-0.5 * (innovation**2 / total + np.log(total)))
 
 
 def test_a_range_from_far_is_a_linear_row() -> None:

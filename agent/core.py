@@ -351,7 +351,7 @@ class AgentCore:
         own = block(present.index(self._agent_id))
         whole = in_layout(estimate, present, self.layout)
         if self.far_field.is_on:
-            whole = self.far_field.added_to(whole, present, self.layout)
+            whole = self.far_field.added_to(whole, present)
         ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time, present)
         message = estimate_message(estimate, present, own)
         changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)

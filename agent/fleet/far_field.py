@@ -16,8 +16,8 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from agent.fleet.neighbourhood import is_limited
 from estimators.estimator import Estimate
-from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
-from estimators.model.measurements import Vector
+from estimators.model.layout import STATES_PER_AGENT, states_of
+from estimators.model.measurements import Matrix, Vector
 from estimators.model.unknown_motion import drift_variances
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.far_body import MAX_REPORTS, FarReport, FarReports
@@ -25,6 +25,8 @@ from transport.messages.half_floats import LARGEST_HALF
 from transport.messages.measurement_body import MAX_POSITION_M, MAX_SPEED_MPS
 
 REPORT_EVERY_S = 1.0
+NEVER = -(2**40)
+"""Tick of a report that there is none of."""
 AHEAD_TICKS = 2
 """Reports of a drone whose clock is ahead by more are refused."""
 
@@ -41,6 +43,10 @@ class FarField:
         self._accel_variance = config.estimator.other_accel_variance
         self._every_ticks = max(round(REPORT_EVERY_S / self._period_s), 1)
         self._keep_ticks = math.ceil(config.fleet.absent_after_s / self._period_s)
+        self._slots = {agent: slot for slot, agent in enumerate(config.ids)}
+        self._tick = np.full(len(config.ids), NEVER)
+        """Of the newest report by slot, as are the moments of its state."""
+        self._mean, self._variance = np.zeros((2, len(config.ids), STATES_PER_AGENT))
         self._newest: dict[int, FarReport] = {}
         self._waiting: dict[int, None] = {}
         """Whose newest report has not been passed on, who has waited longest first."""
@@ -98,36 +104,49 @@ class FarField:
                 sent.append(report)
         return FarReports(tick, tuple(sent)) if sent else None
 
-    def added_to(self, estimate: Estimate, members: Collection[int], layout: Layout) -> Estimate:
+    def added_to(self, estimate: Estimate, members: Collection[int]) -> Estimate:
         """An estimate in the whole fleet's layout with those who are not its ``members`` as they reported themselves.
 
         Their ages are those of their reports, their errors independent of all others'. Changes the estimate's arrays.
         """
-        for agent, report in self._newest.items():
-            age = max(estimate.tick - report.tick, 0)
-            if agent in members or agent == self._agent_id or age > self._keep_ticks:
-                continue
-            mean, variance = moved_on(report, age * self._period_s, self._accel_variance)
-            slot = layout.slot(agent)
-            at = states_of([slot])
-            estimate.mean[block(slot)] = mean
-            estimate.covariance[at, at] = variance
-            estimate.age_ticks[slot] = min(age, MAX_AGE_TICKS - 1)
+        age_ticks = np.maximum(estimate.tick - self._tick, 0)
+        is_told = age_ticks <= self._keep_ticks
+        is_told[[self._slots[agent] for agent in members]] = False
+        slots = np.flatnonzero(is_told)
+        if len(slots):
+            at = states_of(slots.tolist())
+            age_s = age_ticks[slots] * self._period_s
+            mean, variance = moved_on(self._mean[slots], self._variance[slots], age_s, self._accel_variance)
+            estimate.mean[at] = mean.ravel()
+            estimate.covariance[at, at] = variance.ravel()
+            estimate.age_ticks[slots] = np.minimum(age_ticks[slots], MAX_AGE_TICKS - 1)
         return estimate
 
     def _take(self, report: FarReport) -> None:
         self._newest[report.agent] = report
         self._waiting.setdefault(report.agent)
+        if report.agent != self._agent_id:
+            slot = self._slots[report.agent]
+            self._tick[slot] = report.tick
+            self._mean[slot], self._variance[slot] = moments(report)
 
 
-def moved_on(report: FarReport, age_s: float, accel_variance: float) -> tuple[Vector, Vector]:
-    """Mean and variance ``(6,)`` of a drone a time after its report, had it flown straight on.
+def moments(report: FarReport) -> tuple[Vector, Vector]:
+    """Mean and variances ``(6,)`` of a report."""
+    mean = np.array((*report.position_m, *report.velocity_mps))
+    return mean, np.square((*report.position_sigma_m, *report.velocity_sigma_mps))
+
+
+def moved_on(mean: Matrix, variance: Matrix, age_s: Vector, accel_variance: float) -> tuple[Matrix, Matrix]:
+    """Means and variances ``(F, 6)`` of drones a time ``(F,)`` after their reports, had they flown straight on.
 
     ``accel_variance``, (m/s2)2 per axis, is of an acceleration that is not known and lasts.
     """
-    mean = np.array((*report.position_m, *report.velocity_mps))
-    mean[:3] += age_s * mean[3:]
-    variance = np.square((*report.position_sigma_m, *report.velocity_sigma_mps))
-    variance[:3] += age_s**2 * variance[3:]
-    variance += np.repeat(drift_variances(age_s, accel_variance), STATES_PER_AGENT // 2)
+    position, speed = slice(0, STATES_PER_AGENT // 2), slice(STATES_PER_AGENT // 2, STATES_PER_AGENT)
+    age_s = age_s[:, None]
+    drifted_m2, drifted_m2ps2 = drift_variances(age_s, accel_variance)
+    mean, variance = mean.copy(), variance.copy()
+    mean[:, position] += age_s * mean[:, speed]
+    variance[:, position] += age_s**2 * variance[:, speed] + drifted_m2
+    variance[:, speed] += drifted_m2ps2
     return mean, variance

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+from estimators.model.measurements import Vector
+
 MANOEUVRE_S = 3.0
 """How long an acceleration that is not known lasts."""
 TILTED_MPS2 = 0.35
@@ -19,7 +21,7 @@ def silence_sigma_m(silent_s: float, accel_variance: float, period_s: float) -> 
     return math.sqrt(accel_variance * period_s * max(silent_s, 0.0) ** 3 / 3.0)
 
 
-def drift_variances(unseen_s: float, accel_variance: float) -> tuple[float, float]:
+def drift_variances(unseen_s: Vector, accel_variance: float) -> tuple[Vector, Vector]:
     """Variances per axis, m2 and (m/s)2, that an acceleration which is not known adds to a state moved on for a time.
 
     The acceleration, of variance q, is taken to last: ``q t^4 / 4`` and ``q t^2``.

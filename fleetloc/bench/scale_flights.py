@@ -40,6 +40,8 @@ RADIUS_M, LAP_S = 5.0, 20.0
 """Every drone flies a circle."""
 MAX_DRAWS = 10_000
 """Of places, until the graph is connected."""
+REPEATS = 3
+"""So often an agent is timed; the least counts."""
 NEAR, FAR = "near", "far"
 
 
@@ -246,9 +248,11 @@ def fly(flight: ScaleFlight) -> ScaleFlown:
     del lockstep
     gc.collect()
     gc.freeze()  # a daemon's process holds one agent: collections are not to look at the flight's hundred
-    times = [
-        _timed(OnboardAgent(config, i, *made[i][0], **made[i][1]), agents[i].calls, settled_s) for i in sorted(agents)
-    ]
+    times = []
+    for i in sorted(agents):
+        args, kwargs = made[i]
+        alone = [_timed(OnboardAgent(config, i, *args, **kwargs), agents[i].calls, settled_s) for _ in range(REPEATS)]
+        times.append(min(alone))  # what else the machine does only adds to it
     gc.unfreeze()
     per_tick = config.fleet.period_s / (flight.duration_s - flight.settle_s)
     from_unix_s = report.start_unix_s + flight.settle_s

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.config.tables import FleetConfig
-from agent.fleet.far_field import moved_on
+from agent.fleet.far_field import moments, moved_on
 from estimators.model.layout import Layout, block, position
 from fleetloc.monitor.alarms import DroneFacts, alarms_of_drone, alarms_of_fleet
 from fleetloc.monitor.links import LinkHistory, link_view, overdue_s
@@ -225,9 +225,11 @@ class FleetPicture:
         age_s = max(now_s - far.of_s, 0.0)
         if age_s > self._config.fleet.absent_after_s:
             return []
-        mean, variance = moved_on(far.report, age_s, self._config.estimator.other_accel_variance)
-        north, east, down = mean[:3].tolist()
-        sigma_m = float(np.sqrt(variance[:3].sum()))
+        mean, variance = moments(far.report)
+        accel_variance = self._config.estimator.other_accel_variance
+        mean, variance = moved_on(mean[None], variance[None], np.array([age_s]), accel_variance)
+        north, east, down = mean[0, :3].tolist()
+        sigma_m = float(np.sqrt(variance[0, :3].sum()))
         return [SeenBy(agent_id=far.relay, position_m=(north, east, down), sigma_m=sigma_m, age_s=age_s)]
 
     def _link(self, sender: int, receiver: int, now_s: float) -> Link:

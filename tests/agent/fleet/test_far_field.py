@@ -39,7 +39,7 @@ def own_estimate(tick: int) -> Estimate:
 def whole(make_config: MakeConfig, far: FarField, tick: int, agents: int = 6) -> Estimate:
     """What drone 1, alone in its joint state, says of the fleet."""
     layout = Layout(make_config(agents).ids)
-    return far.added_to(in_layout(own_estimate(tick), (1,), layout), (1,), layout)
+    return far.added_to(in_layout(own_estimate(tick), (1,), layout), (1,))
 
 
 def test_a_fleet_that_fits_into_a_joint_state_has_no_far_field(make_config: MakeConfig) -> None:
@@ -155,5 +155,5 @@ def test_a_member_of_the_joint_state_is_not_told_from_its_report(make_config: Ma
     assert estimate.mean[block(0)] == pytest.approx(np.arange(1.0, 7.0))
     layout = Layout(make_config(6).ids)
     joint = Estimate(100, np.zeros(12), np.eye(12), Status.OK, np.zeros(2, np.int64), SolverReport())
-    told = far.added_to(in_layout(joint, (1, 2), layout), (1, 2), layout)
+    told = far.added_to(in_layout(joint, (1, 2), layout), (1, 2))
     assert not told.mean[:12].any()

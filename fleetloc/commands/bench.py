@@ -31,7 +31,7 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, loss, faults, blind drones, large fleets, speed, Table I.", rich_markup_mode=None
+        help="Studies: accuracy, loss, faults, scale, speed, Table I.", rich_markup_mode=None
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -253,9 +253,11 @@ def faults(
 
 
 def scale(
-    sizes: Annotated[str, typer.Option(help="Drones of the fleets, separated by commas.")] = "10,20,50,100",
+    sizes: Annotated[
+        str, typer.Option(metavar="LIST", help="Drones of the fleets, separated by commas.")
+    ] = "10,20,50,100",
     whole: Annotated[
-        str, typer.Option(help="Sizes flown besides with a joint state of the whole fleet, by commas.")
+        str, typer.Option(metavar="LIST", help="Sizes flown with a joint state of the whole fleet too, by commas.")
     ] = "20",
     joint_bodies: Annotated[
         int, typer.Option(min=0, max=999, help="Most drones of a joint state; 0: the default of configurations.")

@@ -21,7 +21,7 @@ from transport.messages.header import (
     unpack_header,
 )
 from transport.messages.information_body import decode_part
-from transport.messages.measurement_body import decode_measurements
+from transport.messages.measurement_body import Measurements, decode_measurements
 from transport.messages.reassembly import Reassembler
 from transport.messages.report_body import decode_diagnostics
 from transport.security.auth import Trust, Unsigned, verify
@@ -122,8 +122,11 @@ class Opener:
         if not isinstance(self._trust, Unsigned):
             verify(self._trust[header.sender], key, packet)
         self.replay.commit(header)
-        self._repeats.check(header, body)
+        if header.kind is PacketKind.INFO:
+            self._repeats.check_information(header, body)
         message = self._decode(header, body, now)
+        if isinstance(message, Measurements):
+            self._repeats.check_measurements(header, body, message)
         self.peers.accepted(header, now)
         if message is None:
             return None

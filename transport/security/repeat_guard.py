@@ -3,7 +3,7 @@
 Measurements and information have noise in them: what an honest drone says of one tick it never says of the next, bit
 by bit. A body counts as repeated if it equals the one that came before it in its place, of an earlier tick. The third
 in a row is refused, and all that repeat after it, with their numbering and signatures as good as they may be. Bodies
-that hold a single record are let through, as a drone without sensors has nothing new to say.
+that hold a single record, or accelerations alone, are let through: a drone without sensors has nothing new to say.
 """
 
 from __future__ import annotations
@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 from transport.errors import Reason, Rejected
 from transport.messages.header import Header, PacketKind
+from transport.messages.measurement_body import AccelerationMeasurement, Measurements
 
-WATCHED = (PacketKind.MEAS, PacketKind.INFO)
-FEWEST_ENTRIES = 2
+FEWEST_RECORDS = 2
 MOST_TIMES = 2
 """So often a body may come."""
 PLACES = 64
@@ -42,12 +42,18 @@ class RepeatGuard:
     def __init__(self) -> None:
         self._last: dict[int, dict[_Place, _Last]] = {}
 
-    def check(self, header: Header, body: bytes) -> None:
+    def check_measurements(self, header: Header, body: bytes, message: Measurements) -> None:
         """Raises `Rejected` (REPEATED) if so."""
-        if header.kind not in WATCHED or header.n < FEWEST_ENTRIES:
-            return
-        if header.kind is PacketKind.INFO and not body.startswith(FIRST_PART):
-            return
+        told = len(message.records)
+        if told >= FEWEST_RECORDS and not all(isinstance(each, AccelerationMeasurement) for each in message.records):
+            self._check(header, body)
+
+    def check_information(self, header: Header, body: bytes) -> None:
+        """The same of one part of a pair."""
+        if body.startswith(FIRST_PART):
+            self._check(header, body)
+
+    def _check(self, header: Header, body: bytes) -> None:
         places = self._last.setdefault(header.sender, {})
         place = header.kind, header.round
         last = places.get(place)

@@ -16,7 +16,13 @@ from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, PacketKind
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import Measurements, PositionMeasurement, RangeMeasurement, SpeedMeasurement
+from transport.messages.measurement_body import (
+    AccelerationMeasurement,
+    Measurements,
+    PositionMeasurement,
+    RangeMeasurement,
+    SpeedMeasurement,
+)
 from transport.messages.report_body import Diagnostics
 from transport.security.auth import UNSIGNED, Signing, Trust, sign, verify
 from transport.security.opening import Opener
@@ -173,7 +179,7 @@ def header_with(name: str, value: bytes) -> Callable[[bytes], bytes]:
         (lambda p: p[:-64] + bytes(64), Reason.BAD_SIGNATURE),
         (header_with("magic", b"XX"), Reason.BAD_MAGIC),
         (header_with("version", b"\x02"), Reason.BAD_VERSION),
-        (header_with("kind", b"\x07"), Reason.UNKNOWN_KIND),
+        (header_with("kind", b"\x08"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x00"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x03"), Reason.WRONG_KEY),
         (header_with("sender", b"\x03\x00"), Reason.WRONG_KEY),
@@ -342,6 +348,9 @@ def test_a_member_without_anything_to_say_may_repeat_it() -> None:
         (packet,) = sender.seal(Measurements(tick, (SpeedMeasurement(2, tick, 1.0, 0.25),)), t_ns=T_NS)
         assert receiver.open(packet) is not None
         (packet,) = sender.seal(Measurements(tick, (), 1), t_ns=T_NS)
+        assert receiver.open(packet) is not None
+        unknown = tuple(AccelerationMeasurement(2, tick - k, (0.0, 0.0, 0.0), (1.3, 1.3, 1.3)) for k in range(3))
+        (packet,) = sender.seal(Measurements(tick, unknown, 2), t_ns=T_NS)
         assert receiver.open(packet) is not None
 
 

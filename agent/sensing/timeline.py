@@ -81,7 +81,12 @@ class _Limit:
         """Average change of each of late, m/s2."""
 
     def take(self, force_mps2: Triple) -> bool:
-        """The next sample's specific force in the body's axes; whether it is at the limit."""
+        """The next sample's specific force in the body's axes; whether it is at the limit.
+
+        One that is the last one again in all axes is held, not measured anew: it tells nothing.
+        """
+        if force_mps2 == self._last:
+            return any(self._holds(axis) for axis in range(3))
         for axis, value in enumerate(force_mps2):
             change = abs(value - self._last[axis])
             self._times[axis] = 1 if change != 0.0 else self._times[axis] + 1

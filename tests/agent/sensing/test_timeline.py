@@ -228,6 +228,16 @@ def test_values_in_coarse_steps_repeat_by_chance() -> None:
     assert not made.skipped
 
 
+def test_samples_that_are_held_are_not_at_a_limit() -> None:
+    # GIVEN an autopilot that sends each measured sample ten times
+    made, rng = timeline(), random.Random(5)
+    for i in range(2000):
+        if i % 10 == 0:
+            value = rng.gauss(0.0, 0.3), rng.gauss(0.0, 0.3), rng.gauss(-GRAVITY, 0.3)
+        made.add_imu(ImuSample(0.01 * i, value, (0, 0, 0)))
+    assert not made.skipped
+
+
 def test_an_imu_without_noise_that_stands_still_or_turns_is_not_at_its_limit() -> None:
     made = timeline()
     fill(made, 0.0, 0.5, (0.0, 0.0, 0.0))

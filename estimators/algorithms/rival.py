@@ -21,9 +21,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.integrity.ambiguity import Body
-from estimators.integrity.mirror_images import flat, image_of, mirror
 from estimators.integrity.observability import row_jacobian
+from estimators.integrity.places.ambiguity import Body
+from estimators.integrity.places.mirror_images import flat, image_of, mirror
 from estimators.integrity.thresholds import CERTAIN_NATS, CREDIT, DIRECTIONS, SURE_NATS
 from estimators.model.gaussian import reseated
 from estimators.model.layout import STATES_PER_AGENT, block

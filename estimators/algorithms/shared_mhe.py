@@ -22,9 +22,9 @@ from estimators.algorithms.rival import Passages, Rival, log_likelihood, merged,
 from estimators.algorithms.shared_monitors import Belief, SharedMonitors, Verdict
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, SolverReport, Status
-from estimators.integrity.ambiguity import Body
 from estimators.integrity.finding import Finding, What
 from estimators.integrity.innovations import InnovationMonitor
+from estimators.integrity.places.ambiguity import Body
 from estimators.integrity.thresholds import DECISIVE_NATS
 from estimators.model.gaussian import Pair, Prior, symmetrised
 from estimators.model.layout import Layout, block

@@ -1,10 +1,10 @@
 """What watches over the shared estimator: which places the data tell, and whether they allow another one.
 
 Monitors look at every solved window: what the data alone say (`estimators.integrity.data_observability`), the mirror
-image of the whole fleet (`estimators.integrity.fleet_mirror`), and, of every drone without fixes, other places
-(`estimators.integrity.ambiguity`): what an agent believes of a blind drone is to be as honest as its own word. Here
-is what follows from what they find: a wider covariance, agents that are not observable, another place to be weighed
-against the estimate's (`estimators.algorithms.rival`), or a fleet mirrored.
+image of the whole fleet (`estimators.integrity.places.fleet_mirror`), and, of every drone without fixes, other places
+(`estimators.integrity.places.ambiguity`): what an agent believes of a blind drone is to be as honest as its own word.
+Here is what follows from what they find: a wider covariance, agents that are not observable, another place to be
+weighed against the estimate's (`estimators.algorithms.rival`), or a fleet mirrored.
 """
 
 from __future__ import annotations
@@ -16,7 +16,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.algorithms.rival import Rival
-from estimators.integrity.ambiguity import (
+from estimators.integrity.data_observability import ObservabilityMonitor
+from estimators.integrity.finding import What, has
+from estimators.integrity.places.ambiguity import (
     AmbiguityMonitor,
     Body,
     DroneEvidence,
@@ -25,9 +27,7 @@ from estimators.integrity.ambiguity import (
     body_of,
     rows_of,
 )
-from estimators.integrity.data_observability import ObservabilityMonitor
-from estimators.integrity.finding import What, has
-from estimators.integrity.fleet_mirror import FleetMirrorMonitor, MirrorImage, mirror_offset, mirrored
+from estimators.integrity.places.fleet_mirror import FleetMirrorMonitor, MirrorImage, mirror_offset, mirrored
 from estimators.integrity.thresholds import FLOOR_M, UNDERSTATED
 from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.layout import STATES_PER_AGENT, Layout, block

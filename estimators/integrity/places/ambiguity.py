@@ -2,12 +2,13 @@
 
 The estimator linearises its ranges at one place. Started from a wrong one it may settle in a mirror image, and
 its covariance knows nothing of the other. This monitor follows the drone's state from its rows alone as a Gaussian
-mixture (`estimators.integrity.hypotheses`), with the neighbours where the estimate has them, and says how wrong the
-estimate may be. It sleeps while the drone has fixes.
+mixture (`estimators.integrity.places.hypotheses`), with the neighbours where the estimate has them, and says how
+wrong the estimate may be. It sleeps while the drone has fixes.
 
 The estimate is one hypothesis among the others, and so are the mirror images in the plane of the bodies ranged to
-(`estimators.integrity.mirror_images`): all are corrected with the same rows in the same way, and the doubt between
-two ends when the odds between them are decisive. Every agent runs a monitor for every drone whose records it holds.
+(`estimators.integrity.places.mirror_images`): all are corrected with the same rows in the same way, and the doubt
+between two ends when the odds between them are decisive. Every agent runs a monitor for every drone whose records it
+holds.
 """
 
 from __future__ import annotations
@@ -20,7 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.integrity.finding import Finding, Gravity, What
-from estimators.integrity.hypotheses import (
+from estimators.integrity.places.hypotheses import (
     Mixture,
     correct_linear,
     correct_range,
@@ -30,7 +31,7 @@ from estimators.integrity.hypotheses import (
     reduce,
     split,
 )
-from estimators.integrity.mirror_images import hold_both_sides, image_of
+from estimators.integrity.places.mirror_images import hold_both_sides, image_of
 from estimators.integrity.range_geometry import directions, spread
 from estimators.integrity.thresholds import (
     BLIND_TICKS,

@@ -1,10 +1,10 @@
 """Both sides of a plane: what ranges to bodies in one plane leave open of a drone that is near it.
 
 Ranges to bodies in a plane are the same at a place and at its mirror image in the plane. A hypothesis
-(`estimators.integrity.hypotheses`) that lies astride of the plane is no Gaussian any more once ranges say how far
-from the plane the drone is, and one that has come down on a side may have come down on the wrong one: corrected by
-linearised ranges it is surer of its side than the ranges are. So the first is cut along the normal, and of the second
-the image is held as well. The log odds of the two are never higher than what the Gaussian left of them, of
+(`estimators.integrity.places.hypotheses`) that lies astride of the plane is no Gaussian any more once ranges say how
+far from the plane the drone is, and one that has come down on a side may have come down on the wrong one: corrected
+by linearised ranges it is surer of its side than the ranges are. So the first is cut along the normal, and of the
+second the image is held as well. The log odds of the two are never higher than what the Gaussian left of them, of
 covariance P with an image at an offset d,
 
     CREDIT / 2 d' P^-1 d,
@@ -16,7 +16,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from estimators.integrity.hypotheses import MERGED_SQUARE, MOST, PRUNED_NATS, Mixture, cut
+from estimators.integrity.places.hypotheses import MERGED_SQUARE, MOST, PRUNED_NATS, Mixture, cut
 from estimators.integrity.thresholds import CREDIT, DIRECTIONS, HELD_SPREAD, WEAK_M
 from estimators.model.measurements import Matrix, Vector
 

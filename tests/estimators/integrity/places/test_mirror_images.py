@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimators.integrity.hypotheses import Mixture
-from estimators.integrity.mirror_images import flat, hold_both_sides, image_of, mirrored_states
+from estimators.integrity.places.hypotheses import Mixture
+from estimators.integrity.places.mirror_images import flat, hold_both_sides, image_of, mirrored_states
 from estimators.integrity.thresholds import CREDIT
 
 PLACES = np.array([[8.0, 0.0, 0.0], [-6.0, 7.0, 0.0], [-5.0, -8.0, 0.0]])

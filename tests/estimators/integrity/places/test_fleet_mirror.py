@@ -8,7 +8,7 @@ import pytest
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
 from estimators.integrity.finding import Finding, Gravity, What, has
-from estimators.integrity.fleet_mirror import (
+from estimators.integrity.places.fleet_mirror import (
     CREDIT,
     FleetMirrorMonitor,
     MirrorImage,

@@ -7,9 +7,16 @@ from collections.abc import Mapping
 import numpy as np
 import pytest
 
-from estimators.integrity.ambiguity import AmbiguityMonitor, Body, DroneEvidence, Elsewhere, Understated, determined
 from estimators.integrity.finding import Finding, Gravity, What, has
-from estimators.integrity.hypotheses import Mixture, correct_linear, correct_range, predict
+from estimators.integrity.places.ambiguity import (
+    AmbiguityMonitor,
+    Body,
+    DroneEvidence,
+    Elsewhere,
+    Understated,
+    determined,
+)
+from estimators.integrity.places.hypotheses import Mixture, correct_linear, correct_range, predict
 from estimators.integrity.thresholds import BLIND_TICKS
 from estimators.model.layout import Layout
 from estimators.model.measurements import RowTable, empty_rows, position_rows, range_row, velocity_rows

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimators.integrity.hypotheses import (
+from estimators.integrity.places.hypotheses import (
     MOST,
     Mixture,
     correct_linear,

@@ -228,6 +228,7 @@ def troubleshooting() -> str:
         Finding(What.AUTOPILOT, Gravity.DEGRADED, detail="lost"),
         Finding(What.IMU_GAP, Gravity.DEGRADED),
         Finding(What.NO_FIX, Gravity.DEGRADED),
+        Finding(What.UNAIDED, Gravity.DEGRADED),
         (Finding(What.SILENT, Gravity.DEGRADED, 2), Finding(What.SILENT, Gravity.DEGRADED, 3)),
     ],
     ids=lambda found: "",

@@ -57,6 +57,11 @@ def _limits(settings: EstimatorSettings) -> Iterator[Fault]:
     for name, sides in (("north_m", vehicle.north_m), ("east_m", vehicle.east_m)):
         if sides is not None and not (-math.inf < sides[0] < sides[1] < math.inf):
             yield Fault(f"{key}.{name}", "[lowest, highest], finite, the first below the second", f"{list(sides)}")
+        elif sides is not None and settings.state_box_position_m is not None:
+            box = settings.state_box_position_m
+            if sides[0] >= box or sides[1] <= -box:
+                expected = f"a part of +-{box:g}, which estimator.state_box_position_m leaves"
+                yield Fault(f"{key}.{name}", expected, f"{list(sides)}")
 
 
 def _agents(config: FleetConfig) -> Iterator[Fault]:

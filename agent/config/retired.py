@@ -69,6 +69,7 @@ LATER: Mapping[str, object] = {
     "transport.exchanges": 1,
     "estimator.systematic_errors": False,
     "estimator.robust": False,
+    "fleet.joint_bodies": 999,
 }
 """Keys that came later, and what was so before them: a flight log without such a key was flown like that."""
 

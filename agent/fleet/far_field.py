@@ -15,13 +15,13 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.neighbourhood import is_limited
+from agent.fleet.tracking import ABSENT_VARIANCE
 from estimators.estimator import Estimate
 from estimators.model.layout import STATES_PER_AGENT, states_of
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.unknown_motion import drift_variances
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.far_body import MAX_REPORTS, FarReport, FarReports
-from transport.messages.half_floats import LARGEST_HALF
 from transport.messages.measurement_body import MAX_POSITION_M, MAX_SPEED_MPS
 
 REPORT_EVERY_S = 1.0
@@ -42,7 +42,7 @@ class FarField:
         self._period_s = config.fleet.period_s
         self._accel_variance = config.estimator.other_accel_variance
         self._every_ticks = max(round(REPORT_EVERY_S / self._period_s), 1)
-        self._keep_ticks = math.ceil(config.fleet.absent_after_s / self._period_s)
+        self._keep_ticks = min(math.ceil(config.fleet.absent_after_s / self._period_s), MAX_AGE_TICKS - 1)
         self._slots = {agent: slot for slot, agent in enumerate(config.ids)}
         self._tick = np.full(len(config.ids), NEVER)
         """Of the newest report by slot, as are the moments of its state."""
@@ -59,7 +59,7 @@ class FarField:
         sigma = np.sqrt(estimate.covariance.diagonal()[own])
         if np.abs(mean[:3]).max() > MAX_POSITION_M or np.abs(mean[3:]).max() > MAX_SPEED_MPS:
             return
-        if sigma.max() > LARGEST_HALF or sigma.min() <= 0.0:
+        if sigma.max() >= math.sqrt(ABSENT_VARIANCE) or sigma.min() <= 0.0:
             return  # it knows nothing of itself
         north, east, down, *velocity = mean.tolist()
         s_north, s_east, s_down, *speed_sigma = sigma.tolist()

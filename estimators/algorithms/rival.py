@@ -16,7 +16,7 @@ places. The doubt ends when the odds are decisive for the estimate, or when both
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -112,11 +112,13 @@ class Passages:
     """How near each drone without fixes has come to the plane of the bodies that it is ranged to."""
 
     def __init__(self, agents: int) -> None:
-        self.forget(agents)
-
-    def forget(self, agents: int) -> None:
-        """Begin anew, with a fleet of so many."""
         self._lead_nats = np.full(agents, CERTAIN_NATS)
+
+    def change_members(self, stayed: Mapping[int, int], agents: int) -> None:
+        """Go on with another fleet; ``stayed``: by new slot, the old one."""
+        before, self._lead_nats = self._lead_nats, np.full(agents, CERTAIN_NATS)
+        for slot, was in stayed.items():
+            self._lead_nats[slot] = before[was]
 
     def settle(self, slot: int) -> None:
         """Take a drone's side as decided until it comes near a plane again."""

@@ -15,6 +15,7 @@ with what its linearisation misses (`estimators.model.second_order`), and monito
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -137,7 +138,7 @@ class SharedMovingHorizonEstimator:
         pair = self._consensus.pair()
         if pair is not self._own:
             self.belief = self.belief.with_pair(self._own, pair)
-        before = self._rival
+        before, self.belief = self._rival, self._resized(self.belief)
         problem, solution, moves = self._compared(*self._solved(self.belief, self._last, budget), budget)
         self._learn(problem, solution)
         contradictions = self._contradictions(problem, solution)
@@ -176,18 +177,18 @@ class SharedMovingHorizonEstimator:
         self, problem: SlowProblem, solution: SlowSolution, budget: int | None
     ) -> tuple[SlowProblem, SlowSolution, int]:
         """The window and its solution, or those of the rival if it leads now; and how often that happened."""
-        rival = self._rival
+        rival, gained_nats = self._rival, 0.0
         if rival is None:
             return problem, solution, 0
         try:
-            theirs, elsewhere = self._solved(rival.belief, rival.last, budget)
+            belief = self._resized(rival.belief)
+            theirs, elsewhere = self._solved(belief, rival.last, budget)
+            if self.window.full:
+                gained_nats = log_likelihood(problem, solution, self.belief.covariance)
+                gained_nats -= log_likelihood(theirs, elsewhere, belief.covariance)
         except (ArithmeticError, ValueError):  # where the data cannot be explained, the drone is not
             self._drop_rival(rival)
             return problem, solution, 0
-        gained_nats = 0.0
-        if self.window.full:
-            gained_nats = log_likelihood(problem, solution, self.belief.covariance)
-            gained_nats -= log_likelihood(theirs, elsewhere, rival.belief.covariance)
         rival, moves = rival.weighed(gained_nats, elsewhere, solution.cost), 0
         if rival.leads:
             rival, problem, solution, moves = rival.exchanged(solution), theirs, elsewhere, 1
@@ -221,14 +222,16 @@ class SharedMovingHorizonEstimator:
         self._passages.settle(rival.slot)
         self._rival = None
 
+    def _resized(self, belief: SlowBelief) -> SlowBelief:
+        """A belief whose slow errors have the sizes of now."""
+        return belief if self._sizes is None else belief.resized(self._present_sizes())
+
     def _solved(
         self, belief: SlowBelief, last: SlowSolution | None, budget: int | None
     ) -> tuple[SlowProblem, SlowSolution]:
         """The window's problem with a belief about its start, and its solution, begun where the last one ended."""
         settings = self.settings
-        white = np.ones((self.layout.size, 3))
-        if self._sizes is not None:
-            belief, white = belief.resized(self._present_sizes()), self._sizes.white_factors()
+        white = np.ones((self.layout.size, 3)) if self._sizes is None else self._sizes.white_factors()
         problem = slow_problem(
             self.window,
             belief,
@@ -299,8 +302,8 @@ class SharedMovingHorizonEstimator:
         if self._sizes is not None:
             self._sizes.change_members(change)
         self.belief = self.belief.reindexed(change, self._present_sizes())
-        self._states = self._last = self._rival = None
-        self._passages.forget(change.after.size)
+        self._states = self._last = None
+        self._keep_doubt(change)
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)
         self._consensus.change_members(change)
@@ -308,6 +311,15 @@ class SharedMovingHorizonEstimator:
         began = {each: self._at_last_tick(each, prior) for each, prior in change.fresh.items()}
         self._limits = state_limits(self.settings, self.layout.size)
         self._monitors.change_members(change, began, self._limits)
+
+    def _keep_doubt(self, change: MemberChange) -> None:
+        """Who else joins or leaves decides nothing about a blind drone."""
+        self._passages.change_members(change.stayed, change.after.size)
+        rival, now = self._rival, {was: slot for slot, was in change.stayed.items()}
+        self._rival = None
+        if rival is not None and rival.slot in now:
+            belief = rival.belief.reindexed(change, self._present_sizes())
+            self._rival = replace(rival, slot=now[rival.slot], belief=belief, last=None)
 
     def _at_last_tick(self, slot: int, prior: Prior) -> Body:
         """A prior of a state, of `prior_tick`, brought to the window's last tick."""

@@ -141,10 +141,13 @@ class InnovationMonitor:
     def observe(self, evidence: Residuals) -> tuple[Finding, ...]:
         """A finding about each slot whose fixes contradict the rest, an alarm where it is the own one."""
         self._average(evidence)
+        self._unfixed_s += self._period_s
+        self._unfixed_s[evidence.rows["agent"][evidence.rows["kind"] == Kind.POSITION]] = 0.0
         squares = self._sensors.values[0].reshape(-1, KINDS)[:, [Kind.POSITION, Kind.VELOCITY]].max(axis=1)
         limit = np.where(self.contradictory, AGREEING_SQUARE, CONTRADICTING_SQUARE)
-        self.contradictory = squares > limit
-        self.ignored = Ignored(self._ignored_receivers(squares), self._ignored_pairs(evidence.rows, squares))
+        # fixes that have stopped contradict nothing any more
+        self.contradictory = (squares > limit) & (self._unfixed_s <= SETTLED_S)
+        self.ignored = Ignored(self._ignored_receivers(squares), self._ignored_pairs(squares))
         self._ignored_s = np.where(self.ignored.receivers, self._ignored_s + self._period_s, 0.0)
         return tuple(
             self._finding(int(slot), float(squares[slot]), float(limit[slot]))
@@ -193,16 +196,14 @@ class InnovationMonitor:
     def _ignored_receivers(self, squares: Vector) -> NDArray[np.bool_]:
         """Rows lose their weight where enough other receivers tell, and regain it once they agree."""
         ignored = self.ignored.receivers & self.contradictory
-        witnesses = len(squares) - np.count_nonzero(self.contradictory)
+        witnesses = np.count_nonzero(~self.contradictory & (self._unfixed_s <= RECENT_S))
         for slot in np.flatnonzero(self.contradictory & ~ignored & (squares > IGNORED_SQUARE)):
             ignored[slot] = witnesses >= FEWEST_WITNESSES
         return np.asarray(ignored)
 
-    def _ignored_pairs(self, rows: RowTable, squares: Vector) -> NDArray[np.bool_]:
+    def _ignored_pairs(self, squares: Vector) -> NDArray[np.bool_]:
         """Ranges lose their weight where fixes that fit hold both ends, and regain it once they agree."""
         agents = len(squares)
-        self._unfixed_s += self._period_s
-        self._unfixed_s[rows["agent"][rows["kind"] == Kind.POSITION]] = 0.0
         held = (self._unfixed_s <= RECENT_S) & ~self.contradictory
         pairs = _symmetric(self._pairs.values[0], agents)
         worse = pairs > np.maximum(squares[:, None], squares[None, :])

@@ -277,11 +277,18 @@ def scale(
     """
     from agent.config.tables import JOINT_BODIES
     from fleetloc.bench.scale import scale as study
+    from fleetloc.bench.scale_flights import places_and_edges
     from fleetloc.errors import InputError
 
-    if settle >= duration:
-        raise InputError("--settle", "", f"less than the flight's {duration:g} s", f"{settle:g}")
+    if settle > duration - 2.0:  # far reports come once a second
+        raise InputError("--settle", "", f"at most {duration - 2.0:g}, two seconds less than it flies", f"{settle:g}")
     counts, wholes = _whole_numbers("--sizes", sizes, 2, 999), _whole_numbers("--whole", whole, 2, 999)
+    for size in {*counts, *wholes}:
+        for run in range(seed, seed + runs):
+            try:
+                places_and_edges(size, degree, run)
+            except ValueError as error:
+                raise InputError("--degree", "", "one that gives a connected graph", str(error)) from None
     _prepare(None)
     results = study(
         sizes=counts, whole=wholes, joint_bodies=joint_bodies or JOINT_BODIES, runs=runs, seed=seed,

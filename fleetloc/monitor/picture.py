@@ -116,7 +116,9 @@ class FleetPicture:
         """What a drone of a large fleet passes on of others: the newest report of each is kept."""
         for report in message.reports:
             known = self._far.get(report.agent)
-            if report.agent != sender and (known is None or report.tick > known.report.tick):
+            # a report of the future must not stand for good
+            old = known is not None and now_s - known.of_s > self._config.fleet.absent_after_s
+            if report.agent != sender and (known is None or old or report.tick > known.report.tick):
                 age_s = (message.tick - report.tick) * self._config.fleet.period_s
                 self._far[report.agent] = _Reported(report, sender, now_s - age_s)
 

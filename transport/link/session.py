@@ -54,6 +54,7 @@ QUALITY = {
     Stream.UWB: Quality(zenoh.Priority.DATA_HIGH, True, _BEST_EFFORT),
 }
 OWN_STREAMS = (Stream.MEAS, Stream.INFO, Stream.EST, Stream.DIAG)
+"""Declared before a member shows that it is there; `far` only with its first report, as small fleets have none."""
 
 SampleHandler = Callable[[str, bytes, float], None]
 """(key expression, payload, arrival on the clock of `asyncio` in s)."""

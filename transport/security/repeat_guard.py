@@ -4,6 +4,7 @@ Measurements and information have noise in them: what an honest drone says of on
 by bit. A body counts as repeated if it equals the one that came before it in its place, of an earlier tick. The third
 in a row is refused, and all that repeat after it, with their numbering and signatures as good as they may be. Bodies
 that hold a single record, or accelerations alone, are let through: a drone without sensors has nothing new to say.
+One that stands still, its IMU silent and the output of its receiver filtered, is refused until something changes.
 """
 
 from __future__ import annotations

@@ -125,6 +125,18 @@ def test_a_wrong_value_is_refused_in_one_line_naming_key_expected_and_found(
     assert str(caught.value).startswith(("--set: ", str(LINE3)))
 
 
+@pytest.mark.parametrize(("north_m", "is_fine"), [("[500, 600]", False), ("[-9, -5]", True), ("[50, 600]", True)])
+def test_sides_lie_within_the_box_of_the_states(north_m: str, is_fine: bool) -> None:
+    overrides = ["estimator.state_box_position_m=100", f"estimator.limits.vehicle.north_m={north_m}"]
+    if is_fine:
+        load_config(LINE3, overrides)
+        return
+    with pytest.raises(ConfigError) as caught:
+        load_config(LINE3, overrides)
+    assert caught.value.key == "estimator.limits.vehicle.north_m"
+    assert "state_box_position_m" in caught.value.expected
+
+
 def test_a_ceiling_is_above_the_floor() -> None:
     limits = "estimator.limits.vehicle"
     config = load_config(LINE3, [f"{limits}.floor_m=-2", f"{limits}.ceiling_m=30"])

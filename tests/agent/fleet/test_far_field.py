@@ -12,7 +12,7 @@ import pytest
 from agent.config.tables import FleetConfig
 from agent.fleet.far_field import FarField
 from agent.fleet.membership import is_absent
-from agent.fleet.tracking import in_layout
+from agent.fleet.tracking import ABSENT_VARIANCE, in_layout
 from estimators.estimator import Estimate, SolverReport, Status
 from estimators.model.layout import Layout, block
 from transport.messages.far_body import MAX_REPORTS, FarReport
@@ -67,7 +67,7 @@ def test_the_own_state_is_reported_once_a_second(make_config: MakeConfig) -> Non
 def test_a_drone_that_knows_nothing_of_itself_reports_nothing(make_config: MakeConfig) -> None:
     far = field(make_config)
     for tick in range(2 * EVERY):
-        far.note_own(replace(own_estimate(tick), covariance=1e12 * np.eye(6)), block(0))
+        far.note_own(replace(own_estimate(tick), covariance=ABSENT_VARIANCE * np.eye(6)), block(0))
         assert far.packet(tick) is None
 
 

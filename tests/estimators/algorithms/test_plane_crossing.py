@@ -8,9 +8,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from estimators.estimator import Status
+from estimators.factory import make_estimator
+from estimators.model.layout import Layout
 from estimators.settings import EstimatorSettings
-from sim_bridge.studies.crossing import crossing, heights_m, passed
-from sim_bridge.studies.lockstep import run_lockstep
+from sim_bridge.studies.crossing import BLIND, crossing, heights_m, passed
+from sim_bridge.studies.lockstep import records_of, run_lockstep
 
 SHARED = EstimatorSettings(
     kind="dmhe_shared", window=6, rounds=2, share_inputs="fleet", relay_hops=2, unknown_inputs="hold"
@@ -29,6 +32,23 @@ def test_nobody_is_sure_of_the_wrong_side_and_no_doubt_lasts(seed: int) -> None:
     assert (found.normalised < 2.5).all()
     # and the doubt ends: these hover in the plane for up to a third of the time
     assert found.flagged < 0.5
+
+
+@pytest.mark.parametrize("seed", [5, 13])
+def test_who_else_joins_or_leaves_decides_no_doubt(seed: int) -> None:
+    # GIVEN a blind drone's own estimator, and another whose members are said anew in every tick of a doubt
+    flight, everybody = crossing(seed), (1, 2, 3, 4)
+    statuses: dict[bool, list[Status]] = {False: [], True: []}
+    for changing, told in statuses.items():
+        estimator = make_estimator(SHARED, Layout(everybody), BLIND, flight.x0[BLIND], flight.P0, flight.period_s)
+        for tick in range(len(flight.accel)):
+            if changing and told and told[-1] is Status.NOT_OBSERVABLE:
+                estimator.change_members(everybody, everybody[BLIND], {})
+            estimator.begin(tick, *records_of(flight, [(tick, slot) for slot in range(4)]))
+            told.append(estimator.solve().status)
+    # THEN the doubt is the same, tick by tick
+    assert statuses[False].count(Status.NOT_OBSERVABLE) > 20
+    assert statuses[True] == statuses[False]
 
 
 def test_flights_come_from_their_seed_and_end_on_either_side() -> None:

@@ -106,6 +106,20 @@ def test_ranges_to_a_drone_that_no_fitting_fix_holds_keep_their_weight(fixes: di
     assert ignored_pairs(monitor) == []
 
 
+def test_drones_without_receivers_are_no_witnesses() -> None:
+    # GIVEN five drones of which two have no fixes WHEN one of the three receivers is off THEN nobody can tell which
+    monitor = InnovationMonitor(5, 0, PERIOD_S)
+    [finding] = after(monitor, 100, {0: 9.0, 1: 1.0, 2: 1.0})
+    assert finding.what is What.FIXES_CONTRADICT
+    assert not monitor.ignored.any()
+
+
+def test_a_receiver_that_has_stopped_contradicts_nothing_any_more() -> None:
+    monitor = InnovationMonitor(3, 0, PERIOD_S)
+    assert after(monitor, 100, {0: 9.0, 1: 1.0, 2: 1.0})
+    assert after(monitor, 120, {1: 1.0, 2: 1.0}) == ()
+
+
 def test_averages_are_by_sensor_and_by_pair_and_unknown_where_nothing_came() -> None:
     monitor = InnovationMonitor(3, 0, PERIOD_S)
     for _ in range(200):

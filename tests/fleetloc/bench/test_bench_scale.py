@@ -70,3 +70,8 @@ def test_the_command_compares_sizes_and_the_whole_state(tmp_path: Path, capsys: 
 def test_a_flight_that_is_all_settling_is_refused(capsys: pytest.CaptureFixture[str]) -> None:
     assert cli.main(["bench", "scale", "--duration", "10", "--settle", "12"]) != 0
     assert "--settle" in capsys.readouterr().err
+    # nor one that leaves no time for a far report, nor graphs that cannot be connected
+    assert cli.main(["bench", "scale", "--duration", "6", "--settle", "5"]) != 0
+    assert "--settle" in capsys.readouterr().err
+    assert cli.main(["bench", "scale", "--sizes", "60", "--whole", "5", "--degree", "2"]) != 0
+    assert "--degree" in capsys.readouterr().err

@@ -295,3 +295,15 @@ def test_a_drone_that_only_others_report_of_is_shown_with_its_age_until_its_flee
     # WHEN nothing more comes for as long as a drone is kept
     assert drone(picture.at(50.0 + 9.2, UNIX_S), 3).seen_by is not None
     assert drone(picture.at(50.0 + 9.4, UNIX_S), 3).seen_by is None
+
+
+def test_a_report_of_the_future_does_not_stand_for_good() -> None:
+    config = fleet(fleet={**FLEET, "joint_bodies": 2})
+    picture, sigmas = FleetPicture(config), (0.3, 0.3, 0.4)
+    wild = FarReport(3, 10**6, 0, (9000.0, 0.0, 0.0), (0.0, 0.0, 0.0), sigmas, (0.1, 0.1, 0.1))
+    picture.on_far_reports(1, FarReports(10**6, (wild,)), 50.0)
+    later_s = 50.0 + config.fleet.absent_after_s + 1.0
+    picture.on_far_reports(1, FarReports(1100, (replace(wild, tick=1095, position_m=(7.0, 0.0, 0.0)),)), later_s)
+    seen = drone(picture.at(later_s, UNIX_S), 3).seen_by
+    assert seen is not None
+    assert seen.position_m[0] == pytest.approx(7.0)

@@ -67,10 +67,10 @@ async def test_arguments_name_the_package(script, tmp_path: Path) -> None:
 async def test_stopping_asks_first_and_kills_the_stubborn_alone(script, tmp_path: Path) -> None:
     script('trap "echo bye >&2; exit 0" TERM; echo ready >&2; while :; do sleep 0.05; done')
     polite = await started(tmp_path, "polite")
+    await says(polite, "ready")  # it has read its script, which is written anew now
     script('trap "" TERM; echo ready >&2; while :; do sleep 0.05; done')
     stubborn = await started(tmp_path, "stubborn")
-    for child in (polite, stubborn):
-        await says(child, "ready")
+    await says(stubborn, "ready")
     assert await stop_all((polite, stubborn), grace_s=1.0) == ["stubborn"]
     assert "bye" in polite.last_lines()
     assert stubborn.why_it_ended().startswith("killed by SIGKILL")

@@ -51,6 +51,7 @@ from transport.link.rounds import RoundBarrier
 from transport.messages.far_body import FarReports
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurement, Measurements
+from transport.messages.window_body import WindowStates
 from transport.security.opening import Received
 
 FIX_SHARE = 0.1
@@ -96,7 +97,7 @@ class AgentCore:
         self._link_state = ""
         """Of the autopilot, for the health; told with every `advance`."""
         self._rounds = rounds_of(config)
-        self._barrier: RoundBarrier[Information] = RoundBarrier(max(self._rounds, 1))
+        self._barrier: RoundBarrier[Information | WindowStates] = RoundBarrier(max(self._rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
         self._fix_interval_s: float | None = None
@@ -158,7 +159,7 @@ class AgentCore:
         self.neighbours.on_packet(received.sender, now_s)
         if isinstance(message, Measurements):
             self._on_measurements(received.sender, message)
-        elif isinstance(message, Information):
+        elif isinstance(message, Information | WindowStates):
             self._on_information(received.sender, message, now_s)
         elif isinstance(message, FarReports):
             assert self._tick is not None
@@ -192,7 +193,7 @@ class AgentCore:
         for record in self.records.add_heard(sender, message.records, self._tick):
             self.fleet.note(record, self._tick)
 
-    def _on_information(self, sender: int, message: Information, now_s: float) -> None:
+    def _on_information(self, sender: int, message: Information | WindowStates, now_s: float) -> None:
         outcome = self._barrier.put(sender, message.tick, message.round, message)
         self.counters[f"information: {outcome.name.lower()}"] += 1
         self.neighbours.on_information(sender, now_s)

@@ -35,6 +35,9 @@ class Status(IntEnum):
 class Payload:
     """What one agent sends its neighbours in one consensus round (Borelle et al. 2023, eqs 11-12).
 
+    It is an information pair, or the states of a window: an algorithm that agrees on states has a ``path``, and then
+    the pair is empty.
+
     Attributes
     ----------
     tick : int
@@ -47,6 +50,8 @@ class Payload:
         Rank of the regional observability matrix (25); the consensus weights follow from it.
     degree : int
         Number of neighbours the sender heard in the tick before; Metropolis weights follow from it.
+    path : Matrix ``(S, 6n)``, optional
+        The states of the sender's window, the oldest first; ``tick`` is that of the oldest.
     """
 
     tick: int
@@ -54,6 +59,12 @@ class Payload:
     vector: Vector
     rank: int
     degree: int = 0
+    path: Matrix | None = None
+
+    @classmethod
+    def of_path(cls, tick: int, path: Matrix, degree: int) -> Payload:
+        """The states ``(S, 6n)`` of a window that begins at ``tick``."""
+        return cls(tick, np.zeros((0, 0)), np.zeros(0), 0, degree, path)
 
 
 @dataclass(frozen=True, slots=True)

@@ -33,6 +33,10 @@ def make_estimator(
         from estimators.algorithms.dekf_ci import DistributedEkf
 
         return DistributedEkf(settings, layout, slot, prior_mean, prior_covariance, period_s)
+    if settings.kind == "consensus_mhe":
+        from estimators.algorithms.consensus_mhe import ConsensusMovingHorizonEstimator
+
+        return ConsensusMovingHorizonEstimator(settings, layout, slot, prior_mean, prior_covariance, period_s)
     from estimators.algorithms.centralized import CentralizedEkf
 
     return CentralizedEkf(settings, layout, slot, prior_mean, prior_covariance, period_s)

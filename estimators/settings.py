@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import msgspec
 
-Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "centralized_ekf"]
+Kind = Literal["dmhe_pre_ekf", "dmhe", "dmhe_shared", "dekf_ci", "consensus_mhe", "centralized_ekf"]
 Positive = Annotated[float, msgspec.Meta(gt=0)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -26,7 +26,12 @@ DEFAULTS_OF_KIND: Mapping[str, Mapping[str, Any]] = {
         "held_accel_fade_s": 2.0,  # no vehicle accelerates for long
         "systematic_errors": True,
         "robust": True,
-    }
+    },
+    "consensus_mhe": {
+        "weights": "metropolis",
+        "rounds": 4,  # the diameter of the paper's graphs: fewer leave the far ends apart
+        "reciprocal_ranges": "independent",  # each end uses its own
+    },
 }
 """Defaults that go with a kind; of every other kind those of `EstimatorSettings`, which are the paper's."""
 
@@ -59,6 +64,19 @@ class LimitsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
     vehicle: VehicleLimits = VehicleLimits()
     """Of vehicles."""
+
+
+class LocalWindowTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What ``consensus_mhe`` assumes of the states that its local problem takes from the neighbours."""
+
+    neighbour_sigma_m: Annotated[float, msgspec.Meta(ge=0)] = 3.0
+    """Standard deviation of a neighbour's position on a range's line, added to the range's own."""
+
+    range_gate_m: Positive | None = None
+    """Ranges to neighbours that are further off are left out; absent = none is."""
+
+    reinject_own: bool = True
+    """Whether the own states after the last round are those of the own local problem, and not the average."""
 
 
 class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -118,6 +136,9 @@ class EstimatorSettings(msgspec.Struct, frozen=True, forbid_unknown_fields=True)
 
     reciprocal_ranges: Literal["independent", "shared"] = "independent"
     """Ranges a->b and b->a of one tick: two measurements, or one exchange seen from both ends, fused once."""
+
+    local_window: LocalWindowTable = LocalWindowTable()
+    """Of ``consensus_mhe``."""
 
     iterations_ekf: Count = 1
     """Updates per tick of the centralised EKF; 1 is the plain one, more the iterated one."""

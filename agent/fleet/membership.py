@@ -30,6 +30,7 @@ from estimators.model.unknown_motion import silence_sigma_m
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import AccelerationMeasurement, Measurement, RangeMeasurement
+from transport.messages.window_body import WindowStates
 
 ATTEMPT_EVERY_TICKS = 3
 """Places by ranges are sought this often: an attempt takes some milliseconds."""
@@ -99,13 +100,15 @@ class Membership:
         else:
             self._tracks.note(record)
 
+    def note_window(self, message: WindowStates) -> None:
+        """A neighbour's window: drones that are not located here, as sure as such a word can be."""
+        for agent in filter(self._is_news, message.agents):
+            place, velocity = np.split(message.path[0, block(message.agents.index(agent))], 2)
+            self._told[agent] = message.state_tick, self._tracks.prior(place, velocity)
+
     def note_pair(self, message: Information) -> None:
         """A neighbour's pair: what it knows well of drones that are not located here."""
-        for agent in message.agents:
-            if agent in self.located or (agent in self._heard and agent != self._agent_id):
-                continue
-            if not self.may_be_member(agent):
-                continue
+        for agent in filter(self._is_news, message.agents):
             try:
                 information, vector = marginal_pair(
                     (message.information, message.vector), [message.agents.index(agent)]
@@ -116,6 +119,11 @@ class Membership:
             sigma_m = float(np.sqrt(max(covariance.diagonal()[:3].max(), 0.0)))
             if sigma_m < TOLD_SIGMA_M:
                 self._told[agent] = message.state_tick, self._tracks.prior(*np.split(covariance @ vector, 2))
+
+    def _is_news(self, agent: int) -> bool:
+        """Whether what a neighbour says of a drone may locate it."""
+        known = agent in self.located or (agent in self._heard and agent != self._agent_id)
+        return not known and self.may_be_member(agent)
 
     def note_estimate(self, estimate: Estimate) -> None:
         """The latest estimate of the members."""

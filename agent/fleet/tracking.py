@@ -18,7 +18,7 @@ from agent.fleet.fix_tracks import POSITION_SIGMA_M, VELOCITY_SIGMA_MPS
 from agent.fleet.joint_choice import JointChoice
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
-from estimators.consensus.mapping import mapped_payload
+from estimators.consensus.mapping import mapped_path, mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
 from estimators.integrity.innovations import Innovations
 from estimators.model.gaussian import Prior
@@ -29,6 +29,7 @@ from estimators.settings import EstimatorSettings
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurement
+from transport.messages.window_body import WindowStates
 
 EstimatorFactory = Callable[[EstimatorSettings, Layout, int, Vector, Matrix, float], Estimator]
 """(settings, layout, own slot, prior mean, prior covariance, period in s) -> estimator."""
@@ -114,15 +115,17 @@ class FleetTracker:
         self._estimator.begin(tick, rows, inputs)
         return True
 
-    def outgoing(self, tick: int, round_: int) -> Information:
+    def outgoing(self, tick: int, round_: int) -> Information | WindowStates:
         """What neighbours get in a round."""
         assert self._estimator is not None
         payload = self._estimator.outgoing(round_)
+        if payload.path is not None:
+            return WindowStates(tick, round_, payload.tick, payload.degree, self.roll.members, payload.path)
         return Information(
             tick, round_, payload.tick, payload.rank, self.roll.members, payload.information, payload.vector
         )
 
-    def mix(self, round_: int, received: Mapping[int, Information]) -> None:
+    def mix(self, round_: int, received: Mapping[int, Information | WindowStates]) -> None:
         """One round with what neighbours sent, by sender."""
         assert self._estimator is not None
         own = self._estimator.outgoing(round_)
@@ -131,18 +134,26 @@ class FleetTracker:
         for sender, message in received.items():
             if message.agents != self.roll.members:
                 self._counters["information: other members"] += 1
-                self.roll.note_pair(message)
+                if isinstance(message, WindowStates):
+                    self.roll.note_window(message)
+                else:
+                    self.roll.note_pair(message)
             if message.state_tick != own.tick:  # its window is shorter, as for a few ticks after its start
                 self._counters["information: other window"] += 1
             elif sender not in self.roll.members:
                 self._counters["information: not located"] += 1
             else:
+                slot = self.roll.members.index(sender)
+                if isinstance(message, WindowStates):
+                    path = mapped_path(message.path, message.agents, self.roll.members, own)
+                    pairs[slot] = Payload.of_path(message.state_tick, path, message.degree)
+                    continue
                 pair = Payload(message.state_tick, message.information, message.vector, message.rank)
-                if message.agents != self.roll.members:
+                if message.agents != self.roll.members and own.path is None:
                     if centre is None:
                         centre = np.asarray(np.linalg.solve(own.information, own.vector), np.float64)
                     pair = mapped_payload(pair, message.agents, self.roll.members, centre)
-                pairs[self.roll.members.index(sender)] = pair
+                pairs[slot] = pair
         for slot in self._estimator.mix(round_, pairs):
             self._counters[f"information: refused of {self.roll.members[slot]}"] += 1
 

@@ -1,4 +1,4 @@
-"""Information pairs between agents that see different fleets."""
+"""What is exchanged between agents that see different fleets: information pairs, and windows of states."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from estimators.estimator import Payload
 from estimators.model.gaussian import Pair, marginal_of_states, other_states
 from estimators.model.layout import STATES_PER_AGENT, states_of
-from estimators.model.measurements import Vector
+from estimators.model.measurements import Matrix, Vector
 
 Places = NDArray[np.int64]
 PAIRS_OF_FLEETS = 128
@@ -54,3 +54,17 @@ def mapped_payload(payload: Payload, sender: Sequence[int], receiver: Sequence[i
         (payload.information, payload.vector), sender, receiver, FLAT_INFORMATION, centre
     )
     return Payload(payload.tick, information, vector, payload.rank, payload.degree)
+
+
+def mapped_path(path: Matrix, sender: Sequence[int], receiver: Sequence[int], own: Payload) -> Matrix:
+    """States ``(S, 6n)`` of the bodies ``sender`` as those of the bodies ``receiver``, whose window is ``own``.
+
+    Bodies that the sender has not are where the receiver has them. A window of another length, or for a receiver that
+    has none, comes back as it is.
+    """
+    if tuple(sender) == tuple(receiver) or own.path is None or len(own.path) != len(path):
+        return path
+    kept, _, at = _places(tuple(sender), tuple(receiver))
+    mapped = own.path.copy()
+    mapped[:, at] = path[:, kept]
+    return mapped

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,20 +13,34 @@ STATES_PER_AGENT = 6
 """Position and velocity, ``[pN pE pD vN vE vD]`` in NED metres and metres per second."""
 
 
+class BodyKind(IntEnum):
+    """What a body of the state is; each has one block, whatever its kind."""
+
+    VEHICLE = 0
+    """Flies with an agent of its own, which measures its acceleration."""
+    TARGET = 1
+    """Is no part of the fleet: nothing is told of its motion, and it measures nothing."""
+
+
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Order of the agents in the fleet state.
+    """Order of the bodies in the fleet state.
 
     Attributes
     ----------
     agents : tuple of int
-        Agent ids (1..999) in the order of their blocks. The block of ``agents[s]`` is the *slot* ``s``;
+        Ids (1..999) of the bodies in the order of their blocks. The block of ``agents[s]`` is the *slot* ``s``;
         everything below the estimator interface speaks of slots.
+    targets : frozenset of int
+        Ids of those that are targets; all others are vehicles.
     """
 
     agents: tuple[int, ...]
+    targets: frozenset[int] = frozenset()
 
     def __post_init__(self) -> None:
+        if not self.targets <= set(self.agents):
+            raise ValueError(f"layout: targets {sorted(self.targets)} are not all among {self.agents}")
         if len(set(self.agents)) != len(self.agents):
             raise ValueError(f"layout: agent ids must be distinct, found {self.agents}")
         if not self.agents:
@@ -33,13 +48,22 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """Number of agents n."""
+        """Number of bodies n."""
         return len(self.agents)
 
     @property
     def dimension(self) -> int:
         """Length of the fleet state, 6n."""
         return STATES_PER_AGENT * len(self.agents)
+
+    def kind(self, slot: int) -> BodyKind:
+        """What the body of a slot is."""
+        return BodyKind.TARGET if self.agents[slot] in self.targets else BodyKind.VEHICLE
+
+    @property
+    def target_slots(self) -> tuple[int, ...]:
+        """Slots of the targets, ascending."""
+        return tuple(slot for slot, agent in enumerate(self.agents) if agent in self.targets)
 
     def slot(self, agent_id: int) -> int:
         """Slot of an agent id; raises ``KeyError`` naming the id if it is not in the fleet."""

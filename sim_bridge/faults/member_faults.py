@@ -18,9 +18,12 @@ from sim_bridge.faults.fault_tables import FaultTable, MemberFault, MemberStuck,
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.information_body import STATES_PER_AGENT, Information
 from transport.messages.measurement_body import Measurement, Measurements, PositionMeasurement
+from transport.messages.window_body import WindowStates
 from transport.security.auth import Identity
 from transport.security.sealing import Message, Packet, Sealer
 
+OfTheState = Measurements | Information | WindowStates | FleetEstimate
+"""Messages with something of the fleet's state in them."""
 Place = tuple[type[Message], int]
 """Kind of a message, and which of its tick it is."""
 
@@ -59,7 +62,7 @@ class CorruptSealer(Sealer):
             if isinstance(fault, MemberWrong):
                 message = _wrong(message, fault, self._own_id)
             stuck |= isinstance(fault, MemberStuck)
-        if not isinstance(message, Measurements | Information | FleetEstimate):
+        if not isinstance(message, OfTheState):
             return message  # nothing of the fleet's state in it
         place = _place(message)
         if not stuck or place not in self._last:
@@ -67,12 +70,14 @@ class CorruptSealer(Sealer):
         return _restamped(self._last[place], message.tick) if stuck else message
 
 
-def _place(message: Measurements | Information | FleetEstimate) -> Place:
+def _place(message: OfTheState) -> Place:
     match message:
         case Measurements():
             return Measurements, message.exchange
         case Information():
             return Information, message.round
+        case WindowStates():
+            return WindowStates, message.round
         case FleetEstimate():
             return FleetEstimate, 0
 
@@ -84,7 +89,7 @@ def _restamped(message: Message, tick: int) -> Message:
             later = tick - message.tick
             records: list[Measurement] = [replace(each, tick=each.tick + later) for each in message.records]
             return replace(message, tick=tick, records=tuple(records))
-        case Information():
+        case Information() | WindowStates():
             return replace(message, tick=tick, state_tick=message.state_tick + tick - message.tick)
         case FleetEstimate():
             return replace(message, tick=tick)
@@ -100,6 +105,8 @@ def _wrong(message: Message, fault: MemberWrong, own_id: int) -> Message:
             mean = np.linalg.solve(message.information, message.vector) + _offset(fault, message.agents, own_id)
             information = fault.variance_divisor * message.information
             return replace(message, information=information, vector=information @ mean)
+        case WindowStates():
+            return replace(message, path=message.path + _offset(fault, message.agents, own_id))
         case FleetEstimate():
             return replace(
                 message,

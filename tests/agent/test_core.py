@@ -254,7 +254,7 @@ def test_a_neighbour_with_a_wrong_clock_harms_nobody(make_config: MakeConfig) ->
 # --- fleets ------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf"])
+@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf", "consensus_mhe"])
 def test_a_fleet_finds_itself_and_stays_on_time(make_config: MakeConfig, kind: str) -> None:
     fleet = CirclingFleet(make_config(3, f"estimator.kind={kind}"))
     fleet.run(8)
@@ -269,7 +269,7 @@ def test_a_fleet_finds_itself_and_stays_on_time(make_config: MakeConfig, kind: s
         assert fleet.cores[agent_id].counters["estimator faults"] == 0
 
 
-@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf", "dmhe"])
+@pytest.mark.parametrize("kind", ["dekf_ci", "dmhe_pre_ekf", "dmhe", "consensus_mhe"])
 def test_ticks_without_any_measurement_are_no_fault(make_config: MakeConfig, kind: str) -> None:
     core = onboard_of(make_config(2, f"estimator.kind={kind}", "initial.position_m=[1.0, 2.0, -3.0]")).core
     ready = [o for o in tick_through(core, 100.0, 2.0) if isinstance(o, EstimateReady)]

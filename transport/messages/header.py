@@ -2,7 +2,7 @@
 
 Little endian ``<2sBBHHIIIHHqII``: magic ``CL``, version, kind, sender, flags, boot, sequence number (per
 sender and kind), tick, round, n, time, body length, fleet. ``n`` counts what the body holds: records of a
-measurement body, agents of an information or estimate body, reports of a far-field body, 0 otherwise.
+measurement body, agents of an information, window or estimate body, reports of a far-field body, 0 otherwise.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ KNOWN_FLAGS = FLAG_FLOAT64
 
 
 class PacketKind(IntEnum):
-    """What the body is; one kind for each stream that carries packets. 4 is not used."""
+    """What the body is; its stream is that of its name, but that windows travel as information. 4 is not used."""
 
     MEAS = 1
     INFO = 2
@@ -39,9 +39,12 @@ class PacketKind(IntEnum):
     CLOCK = 5
     DIAG = 6
     FAR = 7
+    WINDOW = 8
 
 
-STREAM_OF_KIND = {kind: Stream[kind.name] for kind in PacketKind}
+STREAM_OF_KIND = {
+    kind: Stream.INFO if kind is PacketKind.WINDOW else Stream[kind.name] for kind in PacketKind
+}
 
 MAX_BODY_BYTES = {
     PacketKind.MEAS: MAX_DATAGRAM_BODY_BYTES,
@@ -50,6 +53,7 @@ MAX_BODY_BYTES = {
     PacketKind.CLOCK: 64,
     PacketKind.DIAG: 16 * 1024,
     PacketKind.FAR: MAX_DATAGRAM_BODY_BYTES,
+    PacketKind.WINDOW: 8 * 1024,
 }
 MAX_PACKET_BYTES = HEADER_BYTES + max(MAX_BODY_BYTES.values()) + SIGNATURE_BYTES
 

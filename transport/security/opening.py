@@ -24,6 +24,7 @@ from transport.messages.information_body import decode_part
 from transport.messages.measurement_body import Measurements, decode_measurements
 from transport.messages.reassembly import Reassembler
 from transport.messages.report_body import decode_diagnostics
+from transport.messages.window_body import decode_window
 from transport.security.auth import Trust, Unsigned, verify
 from transport.security.repeat_guard import RepeatGuard
 from transport.security.replay_guard import ReplayGuard
@@ -148,6 +149,8 @@ class Opener:
             case PacketKind.INFO:
                 part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)
+            case PacketKind.WINDOW:
+                return decode_window(body, tick=h.tick, round_=h.round, agents=h.n, roster=self._roster)
             case PacketKind.EST:
                 return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
             case PacketKind.FAR:

@@ -21,9 +21,10 @@ from transport.messages.header import (
 from transport.messages.information_body import Information, encode_information, float32_suffices
 from transport.messages.measurement_body import Measurements, encode_measurements
 from transport.messages.report_body import Diagnostics, encode_diagnostics
+from transport.messages.window_body import WindowStates, encode_window
 from transport.security.auth import Signing, Unsigned, sign
 
-Message = Measurements | Information | FleetEstimate | FarReports | Diagnostics | ClockAnswer
+Message = Measurements | Information | WindowStates | FleetEstimate | FarReports | Diagnostics | ClockAnswer
 """Everything that travels in a packet."""
 
 
@@ -82,6 +83,9 @@ class Sealer:
                 flags, n = (FLAG_FLOAT64 if double else 0), len(message.agents)
                 parts = encode_information(message, double=double)
                 return [_Body(PacketKind.INFO, part, message.tick, message.round, n, flags) for part in parts]
+            case WindowStates():
+                data, n = encode_window(message), len(message.agents)
+                return [_Body(PacketKind.WINDOW, data, message.tick, message.round, n)]
             case FleetEstimate():
                 data = encode_estimate(message, double=bool(double))
                 flags = FLAG_FLOAT64 if double else 0

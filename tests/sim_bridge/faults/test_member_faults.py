@@ -25,6 +25,7 @@ from transport.messages.measurement_body import (
     RangeMeasurement,
 )
 from transport.messages.report_body import Diagnostics
+from transport.messages.window_body import WindowStates
 from transport.security.auth import Identity
 from transport.security.opening import Opener
 from transport.security.sealing import Message
@@ -120,6 +121,14 @@ def test_a_liar_about_itself_leaves_the_others_where_it_believes_them():
     np.testing.assert_allclose(moved[1, :3], OFFSET_M, atol=1e-6)
     np.testing.assert_allclose(np.delete(moved, slice(6, 9)), 0.0, atol=1e-6)
     np.testing.assert_allclose(told.information, 25.0 * honest.information, rtol=1e-12)
+
+
+def test_a_liars_window_is_off_in_all_its_states():
+    honest = WindowStates(1020, 1, 1018, 2, ROSTER, np.arange(54.0).reshape(3, 18))
+    told = Member(LIE).said(honest, FROM_S)
+    moved = (told.path - honest.path).reshape(3, 3, 6)
+    np.testing.assert_allclose(moved[..., :3], np.broadcast_to(OFFSET_M, (3, 3, 3)))
+    np.testing.assert_array_equal(moved[..., 3:], 0.0)
 
 
 def test_a_liars_estimate_is_off_and_too_sure():

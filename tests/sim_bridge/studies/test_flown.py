@@ -6,9 +6,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from msgspec import convert
 
 from estimators.estimator import Status
-from estimators.settings import EstimatorSettings, default_settings
+from estimators.settings import EstimatorSettings, default_settings, with_kind_defaults
 from sim_bridge.studies.air import Air, lossy
 from sim_bridge.studies.flown import FlownResult, config_of, fly_recording
 from sim_bridge.studies.lockstep import run_lockstep
@@ -80,6 +81,24 @@ def test_bytes_are_counted_by_kind_and_within_what_packets_may_hold(flown: Flown
     assert set(kinds) == {"Measurements", "Information", "FleetEstimate"}
     assert flown.bytes_per_s["all"] == pytest.approx(sum(kinds.values()))
     assert 2 * 10 * 40 < kinds["Measurements"] < 4 * 10 * 1200
+
+
+def test_an_estimator_that_agrees_on_states_flies_like_any_other() -> None:
+    # GIVEN the consensus MHE, whose neighbours get windows instead of information pairs
+    recording = line(60)
+    settings = convert(with_kind_defaults({"kind": "consensus_mhe", "rounds": 2}), EstimatorSettings)
+    flown = fly_recording(recording, settings)
+    # THEN all estimates are in time, windows travel, and the fleet comes to be known
+    assert flown.available.all()
+    assert flown.bytes_per_s["WindowStates"] > 0
+    assert "Information" not in flown.bytes_per_s
+    assert (flown.estimates.status[1:] == Status.OK).all()
+    assert errors(recording, flown.estimates.mean)[50:].mean() < 0.6
+    # and packed or not is only rounding
+    stepped = run_lockstep(recording, settings)
+    assert errors(recording, stepped.mean)[30:].mean() == pytest.approx(
+        errors(recording, flown.estimates.mean)[30:].mean(), rel=0.2
+    )
 
 
 def test_a_drone_without_fixes_flies_on_its_ranges() -> None:

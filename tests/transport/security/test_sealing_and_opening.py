@@ -179,7 +179,7 @@ def header_with(name: str, value: bytes) -> Callable[[bytes], bytes]:
         (lambda p: p[:-64] + bytes(64), Reason.BAD_SIGNATURE),
         (header_with("magic", b"XX"), Reason.BAD_MAGIC),
         (header_with("version", b"\x02"), Reason.BAD_VERSION),
-        (header_with("kind", b"\x08"), Reason.UNKNOWN_KIND),
+        (header_with("kind", b"\x09"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x00"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x03"), Reason.WRONG_KEY),
         (header_with("sender", b"\x03\x00"), Reason.WRONG_KEY),

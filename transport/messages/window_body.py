@@ -1,6 +1,9 @@
 """Window bodies: the states of a whole window, of estimators that agree on states instead of on information pairs.
 
-Wire form, little endian: ``state age u16 | degree u16 | slots u16 | reserved u16 | ids u16[n] | states f32[slots][6n]``.
+Wire form, little endian::
+
+    state age u16 | degree u16 | slots u16 | reserved u16 | ids u16[n] | states f32[slots][6n]
+
 The slots are those of successive ticks, the oldest first; the state age is the packet's tick minus the oldest's.
 """
 

@@ -114,10 +114,22 @@ def _prepared(
         require_epoch(fleet, unix_s=time.time())
         for agent_id in fleet.ids:
             require(fleet, agent_id, config.parent, unix_s=time.time())
+    else:
+        _refuse_modules(config, fleet)
     fleet = run_files.in_folder(fleet, config.parent, folder)
     run_files.clear(folder)
     (folder / run_files.CONFIG).write_text(dump(fleet), encoding="utf-8")
     return fleet
+
+
+def _refuse_modules(path: Path, fleet: FleetConfig) -> None:
+    """Modules on pseudo terminals, and their drivers, live in real time."""
+    from fleetloc.errors import InputError
+    from sim_bridge.world.sim_table import sim_table
+
+    kind = sim_table(fleet).uwb_module
+    if kind != "none":
+        raise InputError(str(path), "sim.uwb_module", '"none" in virtual time (--lockstep)', f'"{kind}"')
 
 
 def _refuse_liars(path: Path, fleet: FleetConfig) -> None:

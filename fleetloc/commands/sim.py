@@ -49,6 +49,7 @@ def sim(
             truth_file=None if out is None else out / TRUTH,
             on_advance=TruthWriter() if truth_lines else None,
             base=config.parent,
+            modules_folder=out or Path(),
         )
     )
     if out is not None:

@@ -20,6 +20,7 @@ from fleetloc.run import live_table, run_files
 from fleetloc.run.fleet_observer import RunObserver
 from fleetloc.run.live_truth import LiveTruth
 from fleetloc.run.processes import Child, cpu_time_s, resident_mb, stop_all
+from sim_bridge.uwb_modules.terminals import device_path
 from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
@@ -91,6 +92,7 @@ class FleetRun:
             )
             for agent_id in config.ids
         }
+        self._drivers = _module_drivers(config, out, file)
         self._simulator = Child(
             "simulator",
             ("sim", file, "--out", str(out), "--truth-lines"),
@@ -112,8 +114,8 @@ class FleetRun:
         """
         with self._signals():
             try:
-                for daemon in self._daemons.values():
-                    await daemon.start()
+                for child in (*self._daemons.values(), *self._drivers):
+                    await child.start()
                 await self._observer.open()
                 await self._all_there()
                 if not self._stop.is_set():
@@ -156,7 +158,7 @@ class FleetRun:
             await self._change(WATCH_S)
 
     def _fail_if_refused(self) -> None:
-        for daemon in self._daemons.values():
+        for daemon in (*self._daemons.values(), *self._drivers):
             process = daemon.process
             if process is not None and process.returncode is not None:
                 code = BAD_INPUT if process.returncode == ExitCode.BAD_INPUT else REFUSED
@@ -223,7 +225,7 @@ class FleetRun:
                 use.end_cpu_s, use.rss_mb = cpu_time_s(daemon.pid), resident_mb(daemon.pid)
 
     def _note_deaths(self) -> None:
-        for daemon in self._daemons.values():
+        for daemon in (*self._daemons.values(), *self._drivers):
             if daemon.running or daemon.stopped_by_us or daemon.name in self._seen_dead:
                 continue
             self._seen_dead.add(daemon.name)
@@ -269,5 +271,20 @@ class FleetRun:
         try:
             await self._observer.close()
         finally:
-            for name in await stop_all((self._simulator, *self._daemons.values())):
+            for name in await stop_all((self._simulator, *self._drivers, *self._daemons.values())):
                 self._say(f"{name} did not end when asked and was killed; see its log in {self._out}")
+
+
+def _module_drivers(config: FleetConfig, out: Path, file: str) -> tuple[Child, ...]:
+    """A driver process per drone where the simulator plays modules; it waits for its module to be plugged in."""
+    kind = sim_table(config).uwb_module
+    if kind == "none":
+        return ()
+    return tuple(
+        Child(
+            f"uwb driver {agent_id}",
+            ("uwb", kind, str(device_path(out, agent_id)), file, "--id", str(agent_id)),
+            run_files.uwb_log_path(out, agent_id),
+        )
+        for agent_id in config.ids
+    )

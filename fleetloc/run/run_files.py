@@ -8,6 +8,7 @@
 ``agent_001.mcap``, ``.tlog``  the flight log of its last daemon (`agent.log.flight_log`), likewise
 ``agent_001.json``             counters of its last daemon, likewise
 ``agent_001.log``              what the daemon said on stderr
+``uwb_001.log``                what the driver of its UWB module said, where a module is simulated
 ``simulator.log``              what the simulator said
 ``simulator.json``             how its run went (`sim_bridge.world.simulator.SimulatorReport`)
 ``report.json``                figures
@@ -33,7 +34,7 @@ SIMULATOR_LOG, SIMULATOR_JSON = "simulator.log", "simulator.json"
 SUMMARY_SUFFIX = ".json"
 BESIDE_SUFFIXES = (SUMMARY_SUFFIX, ".tlog", ".mcap")
 """What goes with a record and keeps its number."""
-_OF_A_RUN = re.compile(r"agent_[0-9]{3}(\.[0-9]+)?\.(estimates|json|log|tlog|mcap)")
+_OF_A_RUN = re.compile(r"agent_[0-9]{3}(\.[0-9]+)?\.(estimates|json|log|tlog|mcap)|uwb_[0-9]{3}\.log")
 
 
 def record_path(directory: Path, agent_id: int) -> Path:
@@ -44,6 +45,11 @@ def record_path(directory: Path, agent_id: int) -> Path:
 def log_path(directory: Path, agent_id: int) -> Path:
     """What a daemon says on stderr."""
     return directory / f"agent_{agent_id:03d}.log"
+
+
+def uwb_log_path(directory: Path, agent_id: int) -> Path:
+    """What the driver of an agent's UWB module says on stderr."""
+    return directory / f"uwb_{agent_id:03d}.log"
 
 
 def keep_earlier_record(directory: Path, agent_id: int) -> None:

@@ -87,6 +87,9 @@ class SimTable(Table, frozen=True):
     """Rate of the simulated receiver."""
     uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
     """Rate at which every pair ranges."""
+    uwb_module: Literal["none", "linktrack", "uci", "dwm1001", "dwm3001-cli"] = "none"
+    """What measures the ranges of a live fleet: modules simulated down to their bytes, on pseudo terminals behind
+    `fleetloc uwb`; or, with none, the simulator's own driver, which sends frames."""
     gps_outages: tuple[GpsOutage, ...] = ()
     """When which receivers see nothing."""
     faults: tuple[FaultTable, ...] = ()

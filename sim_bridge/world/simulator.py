@@ -15,6 +15,7 @@ from agent.config.endpoints import Endpoint, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.radio.security import simulated_mavlink_keys
 from sim_bridge.autopilot.udp_autopilot import AutopilotPort, open_port
+from sim_bridge.uwb_modules.terminals import SimulatedModules
 from sim_bridge.world.range_sessions import open_range_sessions
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.scenario_config import scenario_from_config
@@ -57,12 +58,17 @@ class Simulator:
     """
 
     def __init__(
-        self, simulation: Simulation, publish_ranges: PublishRanges, on_advance: OnAdvance | None = None
+        self,
+        simulation: Simulation,
+        publish_ranges: PublishRanges,
+        on_advance: OnAdvance | None = None,
+        modules: SimulatedModules | None = None,
     ) -> None:
+        """``modules`` bring the ranges in place of frames."""
         self.simulation = simulation
         self._on_advance = on_advance
         self.ports: dict[int, AutopilotPort] = {}
-        self._publish_ranges = publish_ranges
+        self._publish_ranges, self._modules = publish_ranges, modules
         self._drivers = UwbDrivers()
         self._published = 0
         self._failed = 0
@@ -117,7 +123,10 @@ class Simulator:
         for agent, waiting in frames.items():
             self.ports[agent].send(waiting)
         for taken_s, ranges in outputs.ranges:
-            taken = self._publish_ranges(ranges.observer, self._drivers.payload(taken_s, ranges))
+            if self._modules is not None:
+                taken = self._modules.say(taken_s, ranges)
+            else:
+                taken = self._publish_ranges(ranges.observer, self._drivers.payload(taken_s, ranges))
             self._published += taken
             self._failed += not taken
 
@@ -170,8 +179,11 @@ async def simulate(
     stop: asyncio.Event | None = None,
     on_advance: OnAdvance | None = None,
     base: Path = Path(),
+    modules_folder: Path = Path(),
 ) -> SimulatorReport:
     """Run the whole simulator of a fleet; ``base`` is the folder that the key folder is relative to.
+
+    The ports of simulated UWB modules, where ``[sim]`` asks for such, appear in ``modules_folder``.
 
     Starts on the first tick at or after ``start_unix_s`` (absent: now), lasts ``duration_s`` (absent: that of
     ``[sim]``) or until ``stop``, SIGTERM or SIGINT, and then writes the truth. Raises `ScenarioError`,
@@ -182,20 +194,23 @@ async def simulate(
     simulation = _simulation_now(scenario, start_unix_s, simulated_mavlink_keys(config, base))
     stop = stop or asyncio.Event()
     sessions = await open_range_sessions(config, base, session_settings)
-    simulator = Simulator(simulation, sessions.publish, on_advance)
+    modules = None
     try:
+        if sim_table(config).uwb_module != "none":
+            modules = SimulatedModules(sim_table(config).uwb_module, config.ids, modules_folder)
+        simulator = Simulator(simulation, sessions.publish, on_advance, modules)
         async with simulator.serve(links):
             with stop_signals(stop):
                 return await simulator.run(sim_table(config).duration_s if duration_s is None else duration_s, stop)
     finally:
+        if modules is not None:
+            modules.close()
         await sessions.close()
         if truth_file is not None and simulation.world.time_s > 0.0:
             simulation.truth().save(truth_file)
 
 
-def _simulation_now(
-    scenario: Scenario, start_unix_s: float | None, signing_keys: Mapping[int, bytes]
-) -> Simulation:
+def _simulation_now(scenario: Scenario, start_unix_s: float | None, signing_keys: Mapping[int, bytes]) -> Simulation:
     """A simulation on the monotonic clock of this host."""
     unix_offset_s = time.time() - time.monotonic()
     earliest_s = time.monotonic()

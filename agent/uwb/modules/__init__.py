@@ -1,0 +1,1 @@
+"""What UWB modules say on their ports, a parser per protocol: bytes in, ranges out. Sans-I/O."""

@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 
+from agent.config.agreement import shared_settings
 from agent.config.endpoints import LinkKind, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
@@ -29,9 +30,11 @@ from agent.sensing.frames import gravity_mps2
 from agent.sensing.samples import Sample
 from agent.sensing.timeline import Timeline
 from agent.uwb.adapter import UwbAdapter
+from agent.watch.agreement_watch import AgreementWatch
 from agent.watch.health import State
 from agent.watch.position_watch import clock_finding
 from transport.errors import EncodeError, Rejected
+from transport.messages.agreement_body import Agreement, agreement_hash
 from transport.messages.clock_body import ClockAnswer, decode_clock_question
 from transport.messages.uwb_body import UwbFrame
 from transport.security.auth import Identity
@@ -68,10 +71,13 @@ class OnboardAgent:
         link_signing: LinkSigning | None = None,
         journal: Journal | None = None,
         linked: bool = True,
+        recorded: bool = False,
     ) -> None:
         """``unix_s`` and ``host_s`` are one instant on the two clocks; ``link_signing`` is of the autopilot's link.
 
         ``linked``: whether there is such a link; without one samples come ready made (`on_sample`), as from a log.
+        ``recorded``: whether packets come from a flight log; they may be of an earlier version then, and were sent by
+        drones that agreed about what the log's own configuration said, not that of the replay.
         Raises ``ValueError`` for a journal without a link.
         """
         if journal is not None and not linked:
@@ -87,18 +93,31 @@ class OnboardAgent:
         datagrams = kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
         self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
         self.uwb = UwbAdapter(agent_id, config.ids, config.sensors)
-        freshness_s = config.security.freshness_s
+        shared = shared_settings(config)
         self.opener = Opener(
-            config.fleet.name, config.ids, identity.trust, own_id=agent_id, freshness_s=freshness_s
+            config.fleet.name,
+            config.ids,
+            identity.trust,
+            own_id=agent_id,
+            freshness_s=config.security.freshness_s,
+            agreement=None if recorded else agreement_hash(shared),
+            recorded=recorded,
         )
-        self.sealer = Sealer(config.fleet.name, agent_id, boot=identity.boot, signing=identity.signing)
+        self.agreement = AgreementWatch(shared, self.opener.peers)
+        self.sealer = Sealer(
+            config.fleet.name,
+            agent_id,
+            boot=identity.boot,
+            signing=identity.signing,
+            agreement=agreement_hash(shared),
+        )
         self.unsent: Counter[str] = Counter()
         self._told_state = LinkState.SEARCHING
         self._serve_s = -math.inf if linked else math.inf
         """When the autopilot's link is to be served next, host time."""
         self._something_came = True
         """Whether the core has anything new since it last did what was due."""
-        self._look_at_clock(host_s)
+        self._look_around(host_s)
 
     def fleet_s(self, host_s: float) -> float:
         """Fleet time of a host time."""
@@ -162,6 +181,9 @@ class OnboardAgent:
             return
         if isinstance(received.message, ClockAnswer):
             self.opener.peers[received.sender].clock.add(received.message, unix_ns)
+        elif isinstance(received.message, Agreement):
+            self.agreement.on_told(received.sender, received.message)
+            self._look_around(host_s)
         else:
             self.core.on_packet(received, self.fleet_s(host_s))
 
@@ -186,14 +208,17 @@ class OnboardAgent:
         return outputs
 
     def keep_house(self, *, unix_s: float, host_s: float) -> list[Output]:
-        """What is to be done once a second: compare the clocks, give up what is incomplete for too long."""
+        """What is to be done once a second: compare clocks and agreements, give up what is incomplete."""
         self._note(HouseKept(host_s, unix_s), host_s)
         self.opener.expire(host_s)
         stepped = self.clock.sync(unix_s=unix_s, host_s=host_s)
         if stepped:
             self.core = self._new_core()
-        self._look_at_clock(host_s)
-        return [ClockStepped()] if stepped else []
+        self._look_around(host_s)
+        outputs: list[Output] = [ClockStepped()] if stepped else []
+        if self.agreement.is_contradicted(host_s):
+            outputs += self._sealed(self.agreement.own, self._unix_ns(host_s))
+        return outputs
 
     def tell(self, message: Message, host_s: float) -> list[Output]:
         """Send a message of the shell's own, such as what the daemon says of itself."""
@@ -273,10 +298,10 @@ class OnboardAgent:
         if self._journal is not None:
             self._journal.note(event, self.unix_s(host_s))
 
-    def _look_at_clock(self, host_s: float) -> None:
-        """An estimate whose tick fits no packet reaches nobody: say so in the health."""
+    def _look_around(self, host_s: float) -> None:
+        """Say in the health why we reach nobody, as the tick fits no packet, or why others do not reach us."""
         fault = clock_fault(self._config.fleet, self.unix_s(host_s))
-        self.core.health.hold(clock_finding(fault))
+        self.core.health.hold((*clock_finding(fault), *self.agreement.observe(host_s)))
 
     def _new_core(self) -> AgentCore:
         period_s = self._config.fleet.period_s

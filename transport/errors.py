@@ -27,6 +27,8 @@ class Reason(StrEnum):
     UNKNOWN_KIND = "unknown_kind"
     BAD_FLAGS = "bad_flags"
     WRONG_FLEET = "wrong_fleet"
+    DISAGREES = "disagrees"
+    """Its sender was given something else of what the fleet has to share: another origin, period, estimator, ..."""
     BAD_LENGTH = "bad_length"
     WRONG_KEY = "wrong_key"
     """The key expression it came under does not belong to its sender and stream."""

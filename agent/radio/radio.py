@@ -26,7 +26,7 @@ from transport.security.auth import Identity
 from transport.security.sealing import Packet
 
 LOG = logging.getLogger("fleetloc.agent")
-USED_STREAMS = (Stream.MEAS, Stream.INFO)
+USED_STREAMS = (Stream.MEAS, Stream.INFO, Stream.AGREE)
 """What is listened to of every neighbour; in a fleet larger than a joint state also its far field."""
 REDECLARE_AFTER_S = 1.0
 """A neighbour silent for longer is told anew, as often as that, what we listen to: datagrams lose that too."""
@@ -220,9 +220,7 @@ class Radio:
         if due_s is not None:
             self._timer = asyncio.get_running_loop().call_at(due_s, self._deliver)
 
-    def _hand_on(
-        self, key: str, payload: bytes, arrived_s: float, unix_ns: int, asked_ns: int | None = None
-    ) -> None:
+    def _hand_on(self, key: str, payload: bytes, arrived_s: float, unix_ns: int, asked_ns: int | None = None) -> None:
         """Hand on a packet as it was sealed; with ``asked_ns`` only if it answers the question asked then."""
         try:
             if self._envelopes is not None:

@@ -43,6 +43,8 @@ _UNOBSERVABLE = (What.AMBIGUOUS, What.TOO_FEW_RANGED, What.ONE_PLANE, What.MIRRO
 """Of these the first that was found is told: the later ones follow from it, or say the same less exactly."""
 _TEXTS = {
     What.CLOCK: "{0.detail}",
+    What.DISAGREES: "{0.about} refused, differs in {0.detail}",
+    What.OTHER_VERSION: "{0.about} refused, talks version {0.value:.0f} of the packets, not {0.limit:.0f}",
     What.NO_ESTIMATE: "{0.detail}",
     What.NOT_ALIGNED: "",
     What.FELL_BACK: "estimate fell back",
@@ -124,7 +126,7 @@ class HealthMonitor:
         self._next_report_s = float("-inf")
 
     def hold(self, findings: tuple[Finding, ...]) -> None:
-        """Findings that no tick brings, as of the clock: they come first in what follows, until others are held."""
+        """Findings that no tick brings, of clock and agreement: they come first, until others are held."""
         self._held = findings
 
     def update(self, findings: tuple[Finding, ...], now_s: float) -> Health | None:

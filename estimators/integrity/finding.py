@@ -18,6 +18,10 @@ class What(Enum):
 
     CLOCK = auto()
     """The clock is outside the fleet's time: nothing can be sent."""
+    DISAGREES = auto()
+    """A drone was given something else of what the fleet has to share: its packets are refused."""
+    OTHER_VERSION = auto()
+    """A drone's packets are of another version: they cannot be read."""
     NO_ESTIMATE = auto()
     NOT_ALIGNED = auto()
     """The estimate has never been sure enough since its start."""

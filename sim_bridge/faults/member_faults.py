@@ -12,9 +12,11 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from agent.config.agreement import shared_settings
 from agent.config.tables import FleetConfig
 from agent.onboard import OnboardAgent
 from sim_bridge.faults.fault_tables import FaultTable, MemberFault, MemberStuck, MemberWrong
+from transport.messages.agreement_body import agreement_hash
 from transport.messages.estimate_body import FleetEstimate
 from transport.messages.information_body import STATES_PER_AGENT, Information
 from transport.messages.measurement_body import Measurement, Measurements, PositionMeasurement
@@ -34,16 +36,23 @@ def corrupt(
     """Let an agent that has sealed nothing yet say what the faults make of it; ``start_unix_s`` is their zero."""
     own = [fault for fault in faults if isinstance(fault, MemberFault) and agent.agent_id in fault.agents]
     if own:
-        agent.sealer = CorruptSealer(config.fleet.name, agent.agent_id, identity, own, start_unix_s)
+        agent.sealer = CorruptSealer(config, agent.agent_id, identity, own, start_unix_s)
 
 
 class CorruptSealer(Sealer):
     """Seals what faults make of the messages of one agent."""
 
     def __init__(
-        self, fleet: str, agent_id: int, identity: Identity, faults: Sequence[MemberFault], start_unix_s: float
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        identity: Identity,
+        faults: Sequence[MemberFault],
+        start_unix_s: float,
     ) -> None:
-        super().__init__(fleet, agent_id, boot=identity.boot, signing=identity.signing)
+        agreement = agreement_hash(shared_settings(config))
+        fleet, boot, signing = config.fleet.name, identity.boot, identity.signing
+        super().__init__(fleet, agent_id, boot=boot, signing=signing, agreement=agreement)
         self._own_id = agent_id
         self._faults = tuple(faults)
         self._start_unix_s = start_unix_s

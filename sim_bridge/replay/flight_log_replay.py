@@ -126,6 +126,7 @@ def _replay_one(
         Identity(trust=trust_from(start.trust)),
         unix_s=start.unix_s,
         host_s=start.host_s,
+        recorded=True,
     )
     result = FlightLogReplay(path, start.agent, used)
     pairing = _Pairing(result, on_tick)

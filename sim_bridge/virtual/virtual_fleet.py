@@ -27,7 +27,7 @@ from transport.security.sealing import Message
 AIR_S = 0.001
 """How long a packet takes between two agents before the configured loss and delay."""
 HOUSEKEEPING_S = 1.0
-HEARD_STREAMS = (Stream.MEAS, Stream.INFO, Stream.FAR)
+HEARD_STREAMS = (Stream.MEAS, Stream.INFO, Stream.FAR, Stream.AGREE)
 """What agents listen to; estimates and diagnostics are for people."""
 
 OnEstimate = Callable[[OnboardAgent, EstimateReady], None]

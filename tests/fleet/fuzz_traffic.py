@@ -33,8 +33,8 @@ ENOUGH = 30
 LONG_AGO_S = 1_234_567.0
 """No few flipped bits of a time written in digits make it the present."""
 STRANGER_SYSTEM = 77
-HEADER_FIELDS = ("magic", "version", "kind", "sender", "flags", "boot", "seq", "tick", "round", "n", "t_ns",
-                 "body_bytes", "fleet")  # fmt: skip
+HEADER_FIELDS = ("magic", "version", "kind", "sender", "flags", "round", "boot", "seq", "tick", "n",
+                 "body_bytes", "t_ns", "fleet", "agreement")  # fmt: skip
 REJECTED, REJECTED_UWB = "rejected", "rejected uwb"
 NOBODY, OVER_LIMIT = "no subscriber", "over the link's size limit"
 NEVER_ARRIVE = (NOBODY, OVER_LIMIT)
@@ -155,15 +155,15 @@ class PacketMaker:
         return self._forged(self._stranger, sender=int(self._rng.choice((0, 2, 4, 999, 65535))))
 
     def wrong_version(self) -> Shot:
-        return self._forged(self._stranger, version=int(self._rng.choice((0, 2, 255))))
+        return self._forged(self._stranger, version=int(self._rng.choice((0, 1, 3, 255))))
 
     def wrong_kind_or_flags(self) -> Shot:
         if self._rng.random() < 0.5:
             return self._forged(self._stranger, kind=int(self._rng.choice((0, 3, 6, 7, 255))))
-        return self._forged(self._stranger, flags=int(self._rng.integers(2, 65536)))
+        return self._forged(self._stranger, flags=int(self._rng.integers(2, 256)))
 
     def wrong_length(self) -> Shot:
-        return self._forged(self._stranger, body_bytes=int(self._rng.choice((0, 1, 2**16, 2**32 - 1))))
+        return self._forged(self._stranger, body_bytes=int(self._rng.choice((0, 1, 2**15, 2**16 - 1))))
 
     def too_long(self) -> Shot:
         junk = bytes(MAX_PACKET_BYTES + int(self._rng.integers(1, 2000)))

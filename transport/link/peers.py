@@ -71,6 +71,10 @@ class Peer:
         self.rejections = RejectionCounter()
         self.clock = ClockFilter()
         self.last_received_s: float | None = None
+        self.disagreed_s: float | None = None
+        """When it last said, well signed, that it shares something else with the fleet than we do."""
+        self.version: tuple[int, float] | None = None
+        """Another version of the packets under its key, and when; no signature was looked at."""
         self._boot: int | None = None
         self._numbers: dict[PacketKind, _Numbers] = {}
         self._lost_before = 0
@@ -137,6 +141,15 @@ class PeerTable:
     def accepted(self, header: Header, now: float) -> None:
         """Note a packet that was accepted at ``now``; its sender is in the table."""
         self._peers[header.sender].accepted(header, now)
+
+    def disagrees(self, agent_id: int, now: float) -> None:
+        """Note that an agent shares something else with the fleet than we do."""
+        self._peers[agent_id].disagreed_s = now
+
+    def speaks_version(self, agent_id: int, version: int, now: float) -> None:
+        """Note a packet of another version under an agent's key."""
+        if agent_id in self._peers:
+            self._peers[agent_id].version = version, now
 
     def rejected(self, agent_id: int | None, reason: Reason, times: int = 1) -> None:
         """Note packets refused under an agent's key (whoever really sent them)."""

@@ -50,11 +50,12 @@ QUALITY = {
     Stream.INFO: Quality(zenoh.Priority.INTERACTIVE_HIGH, True, _BEST_EFFORT),
     Stream.EST: Quality(zenoh.Priority.DATA_LOW, False, _RELIABLE),
     Stream.FAR: Quality(zenoh.Priority.DATA, False, _RELIABLE),
+    Stream.AGREE: Quality(zenoh.Priority.DATA_LOW, False, _RELIABLE),
     Stream.DIAG: Quality(zenoh.Priority.BACKGROUND, False, _RELIABLE),
     Stream.UWB: Quality(zenoh.Priority.DATA_HIGH, True, _BEST_EFFORT),
 }
 OWN_STREAMS = (Stream.MEAS, Stream.INFO, Stream.EST, Stream.DIAG)
-"""Declared before a member shows that it is there; `far` only with its first report, as small fleets have none."""
+"""Declared before a member shows that it is there; others only with their first packet, as most fleets have none."""
 
 SampleHandler = Callable[[str, bytes, float], None]
 """(key expression, payload, arrival on the clock of `asyncio` in s)."""
@@ -170,9 +171,7 @@ class Session:
             return False
         return True
 
-    async def ask_clock(
-        self, agent_id: int, question: bytes, *, timeout_s: float = 0.2
-    ) -> tuple[bytes, int] | None:
+    async def ask_clock(self, agent_id: int, question: bytes, *, timeout_s: float = 0.2) -> tuple[bytes, int] | None:
         """A neighbour's sealed answer and its arrival on the UTC clock in ns; ``None`` if there is none."""
         answer: asyncio.Future[tuple[bytes, int] | None] = self._loop.create_future()
 

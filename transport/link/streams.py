@@ -37,6 +37,8 @@ class Stream(StrEnum):
     """Liveliness token."""
     CLOCK = "clock"
     """Queryable for the clock offset."""
+    AGREE = "agree"
+    """What the agent shares with the fleet, at 1 Hz while somebody's packets say that they share something else."""
     DIAG = "diag"
     """Health and counters, once a second."""
 

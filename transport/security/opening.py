@@ -8,13 +8,17 @@ from dataclasses import dataclass
 from transport.errors import Reason, Rejected, SettingsError
 from transport.link.peers import PeerTable
 from transport.link.streams import check_agent_id, check_fleet_name, parse_key
+from transport.messages.agreement_body import decode_agreement
 from transport.messages.clock_body import decode_clock_answer
 from transport.messages.estimate_body import decode_estimate
 from transport.messages.far_body import decode_far_reports
 from transport.messages.header import (
     FLAG_FLOAT64,
     HEADER_BYTES,
+    RECORDED_VERSIONS,
     STREAM_OF_KIND,
+    VERSION,
+    VERSION_AT,
     Header,
     PacketKind,
     fleet_hash,
@@ -61,6 +65,11 @@ class Opener:
     freshness_s : float, optional
         Largest difference between the sender's clock and ours; for fleets whose clocks are disciplined. It
         also stops replays to a receiver that has just started and remembers nothing.
+    agreement : int, optional
+        Hash of what the fleet shares; packets of those who share something else are refused but for the one that
+        says what. ``None``: not looked at, as by those who only listen.
+    recorded : bool
+        Whether packets come from a log: then those of earlier versions are opened too.
     replay : ReplayGuard, optional
         With what was seen before a restart.
     on_rejected : callable, optional
@@ -75,6 +84,8 @@ class Opener:
         *,
         own_id: int | None = None,
         freshness_s: float | None = None,
+        agreement: int | None = None,
+        recorded: bool = False,
         replay: ReplayGuard | None = None,
         on_rejected: Callable[[str, Rejected], None] | None = None,
     ) -> None:
@@ -84,6 +95,8 @@ class Opener:
         self._trust = trust
         self._own_id = own_id
         self._freshness_ns = None if freshness_s is None else round(freshness_s * 1e9)
+        self._agreement = agreement
+        self._versions = RECORDED_VERSIONS if recorded else (VERSION,)
         self.replay = replay or ReplayGuard()
         self._on_rejected = on_rejected
         self._repeats = RepeatGuard()
@@ -105,6 +118,8 @@ class Opener:
         except Rejected as rejected:
             parsed = parse_key(key)
             self.peers.rejected(parsed[1] if parsed else None, rejected.reason)
+            if parsed is not None and rejected.reason is Reason.BAD_VERSION:
+                self.peers.speaks_version(parsed[1], packet[VERSION_AT], now)
             if self._on_rejected is not None:
                 self._on_rejected(key, rejected)
             return None
@@ -114,7 +129,8 @@ class Opener:
         self._reassembler.expire(now)
 
     def _open(self, key: str, packet: bytes, now: float, unix_ns: int) -> Received | None:
-        header = unpack_header(packet, fleet=self._fleet, signed=not isinstance(self._trust, Unsigned))
+        signed = not isinstance(self._trust, Unsigned)
+        header = unpack_header(packet, fleet=self._fleet, signed=signed, versions=self._versions)
         self._check_sender(key, header)
         if self._freshness_ns is not None and abs(unix_ns - header.t_ns) > self._freshness_ns:
             raise Rejected(Reason.STALE, f"clock {(unix_ns - header.t_ns) * 1e-9:.3f} s behind ours")
@@ -123,6 +139,10 @@ class Opener:
         if not isinstance(self._trust, Unsigned):
             verify(self._trust[header.sender], key, packet)
         self.replay.commit(header)
+        if self._agreement is not None and header.agreement != self._agreement:
+            self.peers.disagrees(header.sender, now)
+            if header.kind is not PacketKind.AGREE:
+                raise Rejected(Reason.DISAGREES, f"{header.agreement:08x}, ours {self._agreement:08x}")
         if header.kind is PacketKind.INFO:
             self._repeats.check_information(header, body)
         message = self._decode(header, body, now)
@@ -157,6 +177,8 @@ class Opener:
                 return decode_far_reports(body, tick=h.tick, count=h.n, roster=self._roster)
             case PacketKind.CLOCK:
                 return decode_clock_answer(body)
+            case PacketKind.AGREE:
+                return decode_agreement(body)
             case PacketKind.DIAG:
                 report = decode_diagnostics(body)
                 if report.agent_id != h.sender:

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 from transport.errors import EncodeError
 from transport.link.streams import Stream, check_agent_id, key_expression
+from transport.messages.agreement_body import Agreement, encode_agreement
 from transport.messages.clock_body import ClockAnswer, encode_clock_answer
 from transport.messages.estimate_body import FleetEstimate, encode_estimate
 from transport.messages.far_body import FarReports, encode_far_reports
@@ -24,7 +25,9 @@ from transport.messages.report_body import Diagnostics, encode_diagnostics
 from transport.messages.window_body import WindowStates, encode_window
 from transport.security.auth import Signing, Unsigned, sign
 
-Message = Measurements | Information | WindowStates | FleetEstimate | FarReports | Diagnostics | ClockAnswer
+Message = (
+    Measurements | Information | WindowStates | FleetEstimate | FarReports | Agreement | Diagnostics | ClockAnswer
+)
 """Everything that travels in a packet."""
 
 
@@ -49,14 +52,16 @@ class _Body:
 class Sealer:
     """Seals the messages of one agent; sans-I/O, one sequence of numbers per kind.
 
-    ``boot`` must be greater than at every earlier start (`transport.keys.next_boot`). ``left_out`` counts
-    measurement records that did not fit their packet, ``sent`` the packets sealed.
+    ``boot`` must be greater than at every earlier start (`transport.keys.next_boot`), ``agreement`` is the hash of
+    what the fleet shares. ``left_out`` counts measurement records that did not fit their packet, ``sent`` the packets
+    sealed.
     """
 
-    def __init__(self, fleet: str, agent_id: int, *, boot: int, signing: Signing) -> None:
+    def __init__(self, fleet: str, agent_id: int, *, boot: int, signing: Signing, agreement: int = 0) -> None:
         self._agent_id = check_agent_id(agent_id)
         self._keys = {kind: key_expression(fleet, agent_id, STREAM_OF_KIND[kind]) for kind in PacketKind}
         self._fleet = fleet_hash(fleet)
+        self._agreement = agreement
         self._boot = boot
         self._signing = signing
         self._seq = dict.fromkeys(PacketKind, 0)
@@ -92,6 +97,8 @@ class Sealer:
                 return [_Body(PacketKind.EST, data, message.tick, n=len(message.agents), flags=flags)]
             case FarReports():
                 return [_Body(PacketKind.FAR, encode_far_reports(message), message.tick, n=len(message.reports))]
+            case Agreement():
+                return [_Body(PacketKind.AGREE, encode_agreement(message))]
             case Diagnostics():
                 return [_Body(PacketKind.DIAG, encode_diagnostics(message))]
             case ClockAnswer():
@@ -105,7 +112,7 @@ class Sealer:
         header = pack_header(
             Header(
                 kind, self._agent_id, self._boot, self._seq[kind], body.tick, body.round, body.n, t_ns,
-                size, self._fleet, body.flags,
+                size, self._fleet, body.flags, self._agreement,
             )
         )  # fmt: skip
         signature = b""

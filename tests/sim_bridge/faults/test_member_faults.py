@@ -31,6 +31,7 @@ from transport.security.opening import Opener
 from transport.security.sealing import Message
 
 LINE3 = Path(__file__).parents[3] / "configs" / "line3.toml"
+CONFIG = load_config(LINE3, ['fleet.name="test"'])
 ROSTER = (1, 2, 3)
 KEYS = {agent_id: SigningKey(bytes([agent_id]) * 32) for agent_id in ROSTER}
 TRUST = {agent_id: (key.verify_key,) for agent_id, key in KEYS.items()}
@@ -46,7 +47,7 @@ class Member:
     """Drone 2 with faults, and neighbours that open what it seals, each message by one that has heard no other."""
 
     def __init__(self, *faults: MemberWrong | MemberStuck) -> None:
-        self.sealer = CorruptSealer("test", 2, Identity(KEYS[2], TRUST, 5), faults, START_UNIX_S)
+        self.sealer = CorruptSealer(CONFIG, 2, Identity(KEYS[2], TRUST, 5), faults, START_UNIX_S)
 
     def said(self, message: Message, time_s: float) -> Message:
         """What the neighbour takes out of the packets of a message at a time since the start."""

@@ -12,9 +12,10 @@ from nacl.signing import SigningKey
 
 from transport.errors import EncodeError, Reason, Rejected, SettingsError
 from transport.link.streams import Stream, key_expression
+from transport.messages.agreement_body import Agreement
 from transport.messages.clock_body import ClockAnswer
 from transport.messages.estimate_body import FleetEstimate
-from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, PacketKind
+from transport.messages.header import HEADER, HEADER_BYTES, MAX_DATAGRAM_BYTES, VERSION, PacketKind, fleet_hash
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
@@ -22,6 +23,7 @@ from transport.messages.measurement_body import (
     PositionMeasurement,
     RangeMeasurement,
     SpeedMeasurement,
+    encode_measurements,
 )
 from transport.messages.report_body import Diagnostics
 from transport.security.auth import UNSIGNED, Signing, Trust, sign, verify
@@ -95,6 +97,7 @@ def resealed(packet: bytes, at: int, value: bytes) -> bytes:
 MESSAGES: list[tuple[Message, Stream]] = [
     (MEASUREMENTS, Stream.MEAS),
     (Measurements(0, ()), Stream.MEAS),
+    (Agreement({"fleet.period_s": "0.1"}), Stream.AGREE),
     (Diagnostics(2, "NOMINAL", gauges={"age_s": 0.5}), Stream.DIAG),
     (ClockAnswer(1, 2, 3), Stream.CLOCK),
 ]
@@ -156,8 +159,8 @@ def test_ill_conditioned_pairs_travel_in_float64_by_themselves() -> None:
 def field_at(name: str) -> int:
     """Byte at which a header field starts."""
     formats = {
-        "magic": "2s", "version": "B", "kind": "B", "sender": "H", "flags": "H", "boot": "I", "seq": "I",
-        "tick": "I", "round": "H", "n": "H", "t_ns": "q", "body_bytes": "I", "fleet": "I",
+        "magic": "2s", "version": "B", "kind": "B", "sender": "H", "flags": "B", "round": "B", "boot": "I",
+        "seq": "I", "tick": "I", "n": "H", "body_bytes": "H", "t_ns": "q", "fleet": "I", "agreement": "I",
     }  # fmt: skip
     before = list(formats)[: list(formats).index(name)]
     return struct.calcsize("<" + "".join(formats[field] for field in before))
@@ -178,16 +181,18 @@ def header_with(name: str, value: bytes) -> Callable[[bytes], bytes]:
         (lambda p: p[:-64], Reason.UNSIGNED),
         (lambda p: p[:-64] + bytes(64), Reason.BAD_SIGNATURE),
         (header_with("magic", b"XX"), Reason.BAD_MAGIC),
-        (header_with("version", b"\x02"), Reason.BAD_VERSION),
-        (header_with("kind", b"\x09"), Reason.UNKNOWN_KIND),
+        (header_with("version", b"\x01"), Reason.BAD_VERSION),
+        (header_with("version", b"\x03"), Reason.BAD_VERSION),
+        (header_with("kind", b"\x0a"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x00"), Reason.UNKNOWN_KIND),
         (header_with("kind", b"\x03"), Reason.WRONG_KEY),
         (header_with("sender", b"\x03\x00"), Reason.WRONG_KEY),
         (header_with("sender", b"\x00\x00"), Reason.UNKNOWN_SENDER),
-        (header_with("flags", b"\x02\x00"), Reason.BAD_FLAGS),
-        (header_with("body_bytes", b"\xff\xff\xff\xff"), Reason.TOO_LONG),
+        (header_with("flags", b"\x02"), Reason.BAD_FLAGS),
+        (header_with("body_bytes", b"\xff\xff"), Reason.TOO_LONG),
         (header_with("fleet", b"\0\0\0\0"), Reason.WRONG_FLEET),
         (header_with("tick", b"\x0a"), Reason.BAD_SIGNATURE),
+        (header_with("agreement", b"\x0a"), Reason.BAD_SIGNATURE),
         (header_with("boot", b"\xff\xff\xff\xff"), Reason.BAD_SIGNATURE),
         (header_with("seq", b"\xff"), Reason.BAD_SIGNATURE),
         (header_with("t_ns", b"\xff"), Reason.BAD_SIGNATURE),
@@ -406,8 +411,68 @@ def test_what_does_not_fit_a_header_is_not_sent() -> None:
 def test_the_header_is_forty_bytes_as_specified() -> None:
     assert HEADER.size == HEADER_BYTES == 40
     packet = sealed()
-    assert packet[:4] == b"CL\x01\x01"
-    assert HEADER.unpack_from(packet)[3:10] == (2, 0, 5, 1, 9, 0, 3)
+    assert packet[:4] == b"CL\x02\x01"
+    assert HEADER.unpack_from(packet)[3:10] == (2, 0, 0, 5, 1, 9, 3)
+
+
+def test_who_shares_something_else_is_refused_and_remembered_but_may_say_what() -> None:
+    # GIVEN a receiver that was given something else than the sender
+    opener = Opener(FLEET, ROSTER, TRUST, own_id=1, agreement=7)
+    honest = Sealer(FLEET, 2, boot=5, signing=KEYS[2], agreement=7)
+    other = Sealer(FLEET, 2, boot=6, signing=KEYS[2], agreement=8)
+
+    def opened(by: Sealer, message: Message, signed_by: SigningKey | None = None) -> Message | None:
+        (packet,) = by.seal(message, t_ns=T_NS)
+        data = packet.data
+        if signed_by is not None:
+            key = key_expression(FLEET, 2, packet.stream)
+            data = data[:-64] + sign(signed_by, key, data[:HEADER_BYTES], data[HEADER_BYTES:-64])
+        received = opener.open(key_expression(FLEET, 2, packet.stream), data, now=3.0, unix_ns=T_NS)
+        return None if received is None else received.message
+
+    # THEN what nobody signed is not remembered, what it measured is refused, and what it says of itself is not
+    assert opened(honest, MEASUREMENTS) == MEASUREMENTS
+    assert opened(other, MEASUREMENTS, KEYS[3]) is None
+    assert opener.peers[2].disagreed_s is None
+    assert opened(other, MEASUREMENTS) is None
+    assert opener.peers[2].disagreed_s == 3.0
+    assert opened(other, Agreement({"a": "b"})) == Agreement({"a": "b"})
+    assert opener.peers.rejections() == {"bad_signature": 1, "disagrees": 1}
+
+
+def version_one(message: Measurements, signing: Signing) -> bytes:
+    """A packet as daemons sealed them before version 2."""
+    body = encode_measurements(message).body
+    head = struct.pack(
+        "<2sBBHHIIIHHqII", b"CL", 1, 1, 2, 0, 5, 1, message.tick, message.exchange, len(message.records), T_NS,
+        len(body), fleet_hash(FLEET),
+    )  # fmt: skip
+    seal = (
+        sign(signing, key_expression(FLEET, 2, Stream.MEAS), head, body) if isinstance(signing, SigningKey) else b""
+    )
+    return head + body + seal
+
+
+@pytest.mark.parametrize("signed", [True, False])
+def test_a_daemon_of_version_one_is_refused_and_told_of_but_its_log_can_be_opened(signed: bool) -> None:
+    trust = TRUST if signed else UNSIGNED
+    old = version_one(MEASUREMENTS, KEYS[2] if signed else UNSIGNED)
+    receiver = Receiver(trust)
+    assert receiver.open(old, now=4.0) is None
+    assert receiver.refused == [Reason.BAD_VERSION]
+    assert receiver.opener.peers[2].version == (1, 4.0)
+    of_a_log = Opener(FLEET, ROSTER, trust, own_id=1, agreement=None, recorded=True)
+    for packet in (old, sealed(boot=6) if signed else sealed(boot=6, signing=UNSIGNED)):
+        received = of_a_log.open(key_expression(FLEET, 2, Stream.MEAS), packet, now=0.0, unix_ns=T_NS)
+        assert received is not None
+        assert received.message == MEASUREMENTS
+
+
+def test_a_daemon_of_version_one_refuses_ours_by_its_version() -> None:
+    # GIVEN the check that daemons of version 1 have: magic, then the byte behind it
+    magic, version = struct.unpack_from("<2sB", sealed())
+    assert magic == b"CL"
+    assert version == VERSION != 1
 
 
 def test_rejections_name_their_reason_and_what_was_found() -> None:

@@ -15,6 +15,7 @@ from estimators.integrity.innovations import Innovations
 from estimators.model.gaussian import Prior
 from estimators.model.layout import Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
+from estimators.systematic.range_biases import RangeBiases
 
 
 class Status(IntEnum):
@@ -102,6 +103,8 @@ class Estimate:
     """Whose measurements contradict the rest, by slot."""
     innovations: Innovations | None = None
     """How well the measurements of each sensor fit; ``None`` where the algorithm does not tell."""
+    range_biases: RangeBiases | None = None
+    """What ranges are too long by; ``None`` where that is not estimated."""
 
     def __post_init__(self) -> None:
         if not len(self.observable):

@@ -24,6 +24,7 @@ def faults_between(config: FleetConfig) -> Iterator[Fault]:
     yield from _estimator(config)
     yield from _agents(config)
     yield from _edges(config)
+    yield from _uwb_pairs(config)
     yield from _times(config)
     yield from _radio(config)
     yield from _services(config)
@@ -102,6 +103,18 @@ def _baud(config: FleetConfig, key: str, address: str, baud: int) -> Iterator[Fa
         given = str(baud) in address
         found = repr(address) if given else f"{address!r}, which is {baud} baud as it says none"
         yield Fault(key, expected, found)
+
+
+def _uwb_pairs(config: FleetConfig) -> Iterator[Fault]:
+    seen: set[frozenset[int]] = set()
+    for index, each in enumerate(config.sensors.uwb_pairs):
+        key, pair = f"sensors.uwb_pairs[{index}].pair", frozenset(each.pair)
+        yield from unknown_ids(config, key, each.pair)
+        if len(pair) < 2:
+            yield Fault(key, "two different agents", f"{list(each.pair)}")
+        if pair in seen:
+            yield Fault(key, "each pair once", f"a second entry of {sorted(pair)}")
+        seen.add(pair)
 
 
 def _edges(config: FleetConfig) -> Iterator[Fault]:

@@ -101,6 +101,17 @@ class MavlinkTable(Table, frozen=True):
     ones; off is refused there unless the link is serial or on loopback."""
 
 
+class UwbPair(Table, frozen=True):
+    """``[[sensors.uwb_pairs]]``: what calibration found of the ranges of two drones; `fleetloc ranges` writes it."""
+
+    pair: tuple[AgentId, AgentId]
+    """Two drones, whoever measures."""
+    bias_m: Annotated[float, msgspec.Meta(ge=-10, le=10)]
+    """How much too long their ranges are; it is subtracted."""
+    sigma_m: Positive | None = None
+    """1-sigma of a range between them whose driver gives none; absent = ``uwb_sigma_m``."""
+
+
 class SensorsTable(Table, frozen=True):
     """``[sensors]``: the noise and delay that the daemon assumes.
 
@@ -124,6 +135,8 @@ class SensorsTable(Table, frozen=True):
     """1-sigma of a range whose driver gives none."""
     uwb_sigma_floor_m: Positive = 0.03
     """Least 1-sigma, whatever the driver claims: what calibration leaves of a pair's bias does not average out."""
+    uwb_pairs: tuple[UwbPair, ...] = ()
+    """What calibration found, pair by pair; others are taken as they come."""
     uwb_bound_m: Positive | None = None
     """Hard bound of a range's noise; sets its variance (bound squared over 3) where present."""
     accel_sigma_mps2: Positive = 0.1

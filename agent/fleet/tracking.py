@@ -26,6 +26,7 @@ from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
 from estimators.model.measurements import InputTable, Matrix, Vector, empty_inputs, input_rows
 from estimators.model.unknown_motion import unseen_variance
 from estimators.settings import EstimatorSettings
+from estimators.systematic.range_biases import RangeBiases
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import Measurement
@@ -77,6 +78,8 @@ class FleetTracker:
         """Whom the latest estimate speaks of, in the order of its blocks."""
         self.innovations: Innovations | None = None
         """Of the latest estimate, in the same order."""
+        self.range_biases: RangeBiases | None = None
+        """Likewise."""
 
     @property
     def started(self) -> bool:
@@ -166,6 +169,7 @@ class FleetTracker:
         self._counters["estimate moved"] += estimate.report.moves
         self._good = _Good(estimate, self.roll.members, self.roll.own_located)
         self.present, self.innovations = self.roll.members, estimate.innovations
+        self.range_biases = estimate.range_biases
         self.roll.note_estimate(estimate)
         if not self.roll.own_located and estimate.status in (Status.OK, Status.NOT_CONVERGED, Status.NO_DATA):
             estimate = replace(estimate, status=Status.NOT_OBSERVABLE)
@@ -175,7 +179,7 @@ class FleetTracker:
         """The estimate of the own drone before the start: nothing known, and saying so."""
         covariance = ABSENT_VARIANCE * np.eye(STATES_PER_AGENT)
         age = np.array([MAX_AGE_TICKS])
-        self.present, self.innovations = (self._agent_id,), None
+        self.present, self.innovations, self.range_biases = (self._agent_id,), None, None
         return Estimate(tick, np.zeros(STATES_PER_AGENT), covariance, Status.NO_DATA, age, SolverReport())
 
     def fall_back(self, tick: int) -> Estimate:
@@ -185,7 +189,7 @@ class FleetTracker:
             self.forget()
             return self.nothing(tick)
         good = self._good
-        self.present, self.innovations = good.members, None
+        self.present, self.innovations, self.range_biases = good.members, None, None
         self.roll.return_to(good.members, own_located=good.own_located)
         mean, covariance = self._carried(good.estimate, tick)
         return Estimate(tick, mean, covariance, Status.FELL_BACK, good.estimate.age_ticks, SolverReport())

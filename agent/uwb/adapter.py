@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
+from dataclasses import replace
 
 from agent.config.tables import SensorsTable
 from agent.sensing.samples import RangeSample
@@ -29,6 +30,8 @@ class UwbAdapter:
         self._observer = observer
         self._others = frozenset(others)
         self._sensors = sensors
+        self._pairs = {sum(each.pair) - observer: each for each in sensors.uwb_pairs if observer in each.pair}
+        """What calibration found, by the other drone."""
         self.intake = UwbIntake(observer, max_age_s=MAX_AGE_S)
         self.skipped: Counter[str] = Counter()
         """Ranges left out, by reason; `intake` counts refused frames."""
@@ -47,8 +50,20 @@ class UwbAdapter:
     def samples_of(self, frame: UwbFrame, age_s: float, now_s: float) -> list[RangeSample]:
         """The samples in a frame that was accepted ``age_s`` after its measurement, at fleet time ``now_s``."""
         measured_s = now_s - max(age_s, 0.0) - self._sensors.uwb_latency_s
-        samples = (self._sample(entry, measured_s, now_s) for entry in frame.ranges)
+        entries = (self._calibrated(entry) for entry in frame.ranges)
+        samples = (self._sample(entry, measured_s, now_s) for entry in entries if entry is not None)
         return [sample for sample in samples if sample is not None]
+
+    def _calibrated(self, entry: UwbRange) -> UwbRange | None:
+        """The range less its pair's bias; one that is then none is left out."""
+        known = self._pairs.get(entry.other)
+        if known is None:
+            return entry
+        if entry.range_m <= known.bias_m:
+            self.skipped["shorter than its bias"] += 1
+            return None
+        sigma_m = known.sigma_m if entry.sigma_m is None else entry.sigma_m
+        return replace(entry, range_m=entry.range_m - known.bias_m, sigma_m=sigma_m)
 
     def _sample(self, entry: UwbRange, measured_s: float, now_s: float) -> RangeSample | None:
         sigma_m = self._sensors.uwb_sigma_m if entry.sigma_m is None else entry.sigma_m

@@ -133,7 +133,7 @@ def neighbour_gauges(onboard: OnboardAgent, host_s: float, now_s: float) -> dict
     for agent_id, age_s in core.neighbours.ages_s(now_s).items():
         peers[str(agent_id)]["heard_age_s"] = age_s
     return {
-        agent_id: gauges | nis_gauges(onboard, int(agent_id))
+        agent_id: gauges | nis_gauges(onboard, int(agent_id)) | bias_gauges(onboard, int(agent_id))
         for agent_id, gauges in peers.items()
         if int(agent_id) in core.neighbours
     }
@@ -159,6 +159,17 @@ def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
         "weight_gps_position": innovations.weights[slot, Kind.POSITION],
     }
     return {name: round(float(value), 3) for name, value in nis.items() if math.isfinite(value)}
+
+
+def bias_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
+    """What ranges between the own and another drone are too long by, as estimated; nothing where that is unknown."""
+    fleet = onboard.core.fleet
+    biases, present = fleet.range_biases, fleet.present
+    if biases is None or agent_id not in present or onboard.agent_id not in present:
+        return {}
+    pair = present.index(onboard.agent_id), present.index(agent_id)
+    gauges = {"range_bias_m": biases.bias_m[pair], "range_bias_sigma_m": biases.sigma_m[pair]}
+    return {name: round(float(value), 4) for name, value in gauges.items() if math.isfinite(value)}
 
 
 def diagnostics_of(

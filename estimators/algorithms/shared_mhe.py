@@ -36,6 +36,7 @@ from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
 from estimators.solvers.qp import make_engine
 from estimators.systematic.belief import SlowBelief
+from estimators.systematic.range_biases import RangeBiases
 from estimators.systematic.sizes import SystematicSizes
 from estimators.systematic.slow_errors import corrected_rows
 from estimators.window.arrival_cost import first_estimate
@@ -171,7 +172,14 @@ class SharedMovingHorizonEstimator:
             observable,
             contradictions,
             self._innovations.averages(),
+            self._range_biases(solution),
         )
+
+    def _range_biases(self, solution: SlowSolution) -> RangeBiases | None:
+        if self._sizes is None:
+            return None
+        variance = solution.covariance.diagonal()[self.belief.states :]
+        return RangeBiases.of(self.layout.size, solution.slow, variance, self._sizes.sizes())
 
     def _compared(
         self, problem: SlowProblem, solution: SlowSolution, budget: int | None

@@ -143,16 +143,49 @@ def _repeat(
 
 
 def ranges(
-    file: Annotated[Path, typer.Argument(help="CSV or JSON lines with the true distances (true_m or mocap_range).")],
+    files: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="FILE",
+            help="CSV or JSON lines with true distances; or flight logs (.mcap); or CONFIG (.toml) of a live fleet.",
+        ),
+    ],
     outlier_m: Annotated[
         float, typer.Option("--outlier", min=0.0, help="Further than this from its pair's median is an outlier, m.")
     ] = 0.5,
+    write: Annotated[
+        Path | None, typer.Option("--write", metavar="FILE", help="Write the lines of the configuration here.")
+    ] = None,
+    duration_s: Annotated[
+        float, typer.Option("--duration", help="Listen to a live fleet for so many seconds.")
+    ] = 10.0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here.")] = None,
 ) -> None:
     """Bias, noise and outliers of ranges, per pair of drones.
 
-    The file holds the true distances beside the measured ones.
+    From true distances in a file, from the flight logs of drones, or from what the drones of a live fleet estimate.
     """
+    import asyncio
+
+    from fleetloc.errors import InputError
+
+    kinds = {path.suffix.lower() for path in files}
+    if kinds == {".mcap"}:
+        from fleetloc.report.flight_ranges import study_flight_logs
+        from fleetloc.warmup import announce
+
+        announce()
+        study_flight_logs(files, json_file, write)
+        return
+    if len(files) > 1:
+        expected = "flight logs (.mcap), or one file"
+        raise InputError("FILE", "", expected, ", ".join(path.name for path in files))
+    if kinds == {".toml"}:
+        from fleetloc.report.flight_ranges import listen_to_biases
+        from fleetloc.whole_config import load_whole
+
+        asyncio.run(listen_to_biases(load_whole(files[0]), files[0].parent, duration_s, json_file, write))
+        return
     from fleetloc.report.range_study import study_ranges
 
-    study_ranges(file, outlier_m, json_file)
+    study_ranges(files[0], outlier_m, json_file, write)

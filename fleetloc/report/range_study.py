@@ -1,7 +1,8 @@
-"""``fleetloc ranges``: what measured ranges are like, pair by pair, against true distances."""
+"""``fleetloc ranges`` of a file with true distances: what measured ranges are like, pair by pair."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -11,11 +12,14 @@ from numpy.typing import NDArray
 
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
+from fleetloc.report.pair_calibration import CalibratedPair, write_lines
 from sim_bridge.replay.side_files.range_files import RangeCounts, read_ranges
 
 Floats = NDArray[np.float64]
 NORMAL_OF_MAD = 1.4826
 """1-sigma of a normal distribution by its median absolute deviation."""
+MEDIAN_OF_NORMAL = math.sqrt(math.pi / 2.0)
+"""1-sigma of the median of many normal values, by theirs over the root of their number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +34,8 @@ class PairFigures:
     count: int
     bias_m: float
     median_m: float
+    median_sigma_m: float
+    """1-sigma of the median itself; errors that follow each other closely count as fewer."""
     sigma_m: float
     outliers: float
     worst_m: float
@@ -39,19 +45,36 @@ def pair_figures(pair: tuple[int, int], errors_m: Floats, outlier_m: float) -> P
     """Figures of the errors ``(K,)`` of one pair, K at least 1."""
     median_m = float(np.median(errors_m))
     off_m = np.abs(errors_m - median_m)
+    sigma_m = NORMAL_OF_MAD * float(np.median(off_m))
     return PairFigures(
         pair=pair,
         count=len(errors_m),
         bias_m=float(errors_m.mean()),
         median_m=median_m,
-        sigma_m=NORMAL_OF_MAD * float(np.median(off_m)),
+        median_sigma_m=MEDIAN_OF_NORMAL * sigma_m / math.sqrt(_independent(errors_m, median_m, outlier_m)),
+        sigma_m=sigma_m,
         outliers=float(np.mean(off_m > outlier_m)),
         worst_m=float(off_m.max()),
     )
 
 
-def study_ranges(file: Path, outlier_m: float, json_file: Path | None) -> dict[str, Any]:
+def _independent(errors_m: Floats, median_m: float, outlier_m: float) -> float:
+    """How many independent errors tell as much: those of a first-order Gauss-Markov sequence, by its first lag."""
+    close = errors_m[np.abs(errors_m - median_m) <= outlier_m] - median_m
+    count = len(close)
+    power = float(close @ close)
+    if count < 3 or power == 0.0:
+        return float(max(count, 1))
+    lag = min(max(float(close[1:] @ close[:-1]) / power, 0.0), 1.0 - 1.0 / count)
+    return max(count * (1.0 - lag) / (1.0 + lag), 1.0)
+
+
+def study_ranges(
+    file: Path, outlier_m: float, json_file: Path | None, write: Path | None = None
+) -> dict[str, Any]:
     """Print bias, robust sigma and outliers per pair; returns what goes into the JSON file.
+
+    The lines of the configuration go to ``write``.
 
     Raises `InputError` or `ReplayError` for a file without ranges or without true distances.
     """
@@ -78,6 +101,7 @@ def study_ranges(file: Path, outlier_m: float, json_file: Path | None) -> dict[s
                 "count": one.count,
                 "bias_m": one.bias_m,
                 "median_m": one.median_m,
+                "median_sigma_m": one.median_sigma_m,
                 "robust_sigma_m": one.sigma_m,
                 "outlier_fraction": one.outliers,
                 "worst_from_median_m": one.worst_m,
@@ -89,6 +113,7 @@ def study_ranges(file: Path, outlier_m: float, json_file: Path | None) -> dict[s
         "robust_sigma_median_m": float(np.median([one.sigma_m for one in pairs])),
     }
     _print(figures, pairs, counts)
+    write_lines((CalibratedPair(p.pair, p.count, p.median_m, p.median_sigma_m, p.sigma_m) for p in pairs), write)
     if json_file is not None:
         write_json(json_file, figures)
     return figures
@@ -96,18 +121,19 @@ def study_ranges(file: Path, outlier_m: float, json_file: Path | None) -> dict[s
 
 def _of_all(figures: dict[str, Any]) -> list[str]:
     spread = f"{figures['bias_mean_m']:+.3f} ({figures['bias_spread_m']:.3f} apart)"
-    return [spread, "", f"{figures['robust_sigma_median_m']:.3f}", "", ""]
+    return [spread, "", "", f"{figures['robust_sigma_median_m']:.3f}", "", ""]
 
 
 def _print(figures: dict[str, Any], pairs: list[PairFigures], counts: RangeCounts) -> None:
     limit = f"> {figures['outlier_limit_m']:g} m off %"
-    columns = ["pair", "ranges", "bias m", "median m", "robust sigma m", limit, "worst m"]
+    columns = ["pair", "ranges", "bias m", "median m", "+- m", "robust sigma m", limit, "worst m"]
     rows = [
         [
             f"{one.pair[0]} - {one.pair[1]}",
             str(one.count),
             f"{one.bias_m:+.3f}",
             f"{one.median_m:+.3f}",
+            f"{one.median_sigma_m:.3f}",
             f"{one.sigma_m:.3f}",
             f"{100 * one.outliers:.2f}",
             f"{one.worst_m:.2f}",

@@ -115,20 +115,9 @@ def _replay_one(
     path: Path, config: FleetConfig | None, make_estimator: EstimatorFactory, on_tick: OnTick | None
 ) -> FlightLogReplay:
     reader = FlightReader(path)
-    start = reader.start
-    used = recorded_config(start, path) if config is None else config
-    if start.agent not in used.ids:
-        raise LogFileError(f"record {path}: of agent {start.agent}, expected one of {', '.join(map(str, used.ids))}")
-    onboard = OnboardAgent(
-        used,
-        start.agent,
-        make_estimator,
-        Identity(trust=trust_from(start.trust)),
-        unix_s=start.unix_s,
-        host_s=start.host_s,
-        recorded=True,
-    )
-    result = FlightLogReplay(path, start.agent, used)
+    used = recorded_config(reader.start, path) if config is None else config
+    onboard = agent_of(reader, used, make_estimator)
+    result = FlightLogReplay(path, onboard.agent_id, used)
     pairing = _Pairing(result, on_tick)
     for entry in reader:
         if isinstance(entry, RecordedInput):
@@ -142,6 +131,23 @@ def _replay_one(
     result.ended = reader.ended
     result.counters = dict(onboard.core.counters)
     return result
+
+
+def agent_of(reader: FlightReader, config: FleetConfig, make_estimator: EstimatorFactory) -> OnboardAgent:
+    """The agent of a flight log, about to take its first input; raises `LogFileError` for one of another fleet."""
+    start = reader.start
+    if start.agent not in config.ids:
+        expected = ", ".join(map(str, config.ids))
+        raise LogFileError(f"record {reader.path}: of agent {start.agent}, expected one of {expected}")
+    return OnboardAgent(
+        config,
+        start.agent,
+        make_estimator,
+        Identity(trust=trust_from(start.trust)),
+        unix_s=start.unix_s,
+        host_s=start.host_s,
+        recorded=True,
+    )
 
 
 class _Pairing:

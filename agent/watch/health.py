@@ -62,6 +62,8 @@ _TEXTS = {
     What.CONTRADICTORY: "no place explains the measurements",
     What.FIXES_CONTRADICT: "{0.detail} contradict the rest",
     What.FIXES_IGNORED: "{0.detail} contradict the rest, not used",
+    What.DIVERGED: "estimate of {0.about} outside its guaranteed set",
+    What.BOUNDS_BROKEN: "stated bounds broken: {0.detail}",
     What.AUTOPILOT: "autopilot {0.detail}",
     What.IMU_GAP: "IMU incomplete",
     What.UNAIDED: "attitude without aiding",

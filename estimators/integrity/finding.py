@@ -55,6 +55,10 @@ class What(Enum):
     """A drone's fixes and the rest of what was measured do not fit together."""
     FIXES_IGNORED = auto()
     """A drone's fixes do not fit the rest, and the position has been held without them for a while."""
+    DIVERGED = auto()
+    """The estimate of a neighbour's relative position is outside the set that certainly holds it."""
+    BOUNDS_BROKEN = auto()
+    """Bounds that sensors are said to keep contradict each other: what is certain of a neighbour is not."""
     AUTOPILOT = auto()
     """The link to the autopilot is not there."""
     IMU_GAP = auto()

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fleetloc.bench.fusion_command import fusion
+from fleetloc.bench.integrity.commands import setmembership
 from fleetloc.options import Overrides
 
 if TYPE_CHECKING:
@@ -31,7 +32,7 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, loss, faults, scale, speed, Table I.", rich_markup_mode=None
+        help="Studies: accuracy, loss, faults, scale, speed, sets, Table I.", rich_markup_mode=None
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -43,6 +44,7 @@ def register(app: typer.Typer) -> None:
     bench.command("fusion")(fusion)
     bench.command("faults")(faults)
     bench.command("scale")(scale)
+    bench.command("setmembership")(setmembership)
     app.add_typer(bench, name="bench")
 
 

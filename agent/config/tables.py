@@ -28,7 +28,7 @@ class OriginTable(Table, frozen=True):
     """WGS84 latitude."""
     lon_deg: Annotated[float, msgspec.Meta(ge=-180, le=180)]
     """WGS84 longitude."""
-    alt_m: Annotated[float, msgspec.Meta(ge=-500, le=20_000)]
+    alt_m: Annotated[float, msgspec.Meta(ge=-12_000, le=100_000)]
     """Its height, above what ``altitude`` says."""
     altitude: Literal["ellipsoid", "msl"] = "msl"
     """What ``alt_m`` and all heights of the fleet are above: the WGS84 ellipsoid or mean sea level."""

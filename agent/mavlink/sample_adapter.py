@@ -8,18 +8,22 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 
 from agent.config.tables import SensorsTable
+from agent.mavlink.boot_times import WRAP_MS_S, WRAP_US_S, turns
 from agent.mavlink.codec import Message, mavlink
+from agent.mavlink.utc_stamps import UtcStamps, unrolled
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.latency import Stamp, gps_prior, imu_latency_s
+from agent.sensing.receivers import ReceiverChoice
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Sample, Triple
 
 MILLI_G_MPS2 = 9.80665e-3
 UNKNOWN_16 = 65535
 PREFERENCE_HOLD_S = 1.0
-"""A second-best message serves once the better one has been silent for this long."""
+"""A message serves once those that are better have been silent for this long."""
 MAX_STAMP_AGE_S = 5.0
 MAX_STAMP_LEAD_S = 0.2
 UNIX_US = 10**15
@@ -35,6 +39,11 @@ GPS_SPEED_SIGMA_MPS = 0.3
 """Where the receiver does not report a speed accuracy."""
 GPS_RANGE_ERROR_M = 2.5
 """1-sigma of a pseudorange (UERE), single frequency: sigma = dilution times this where the receiver reports none."""
+_SCALED_IMUS = (
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+    mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
+)
 _ACCEL_AND_GYRO = 0b111111
 MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
 """Per axis; beyond what any IMU of a drone can measure (100 g, 5700 deg/s), so no measurement."""
@@ -47,44 +56,65 @@ _AIDED = mavlink.ESTIMATOR_PRED_POS_HORIZ_REL | mavlink.ESTIMATOR_PRED_POS_HORIZ
 """Flags of which an aided estimator has one: they go at once with the fix, those of its estimate after seconds."""
 
 
+@dataclass(slots=True)
+class _HeardReceiver:
+    """What is remembered of one of the autopilot's receivers."""
+
+    number: int
+    """From 0."""
+    last_fix: tuple[int, ...] = ()
+    """Time, place and velocity, as sent."""
+    repeats: int = 0
+    """How often the last fix has come again, with another time."""
+    frozen: bool = False
+    utc: UtcStamps = field(default_factory=UtcStamps)
+
+
 class SampleAdapter:
     """The samples of one autopilot.
 
-    ``skipped`` counts messages that gave none, by reason. Fleet times come from ``fleet_time_of_boot``;
-    ``epoch_unix_s`` makes fleet time of the stamps that are Unix time.
+    ``skipped`` counts messages that gave none, by reason, ``noted`` what was dealt with. Fleet times come from
+    ``fleet_time_of_boot``; ``epoch_unix_s`` makes fleet time of the stamps that are Unix time. ``receivers`` are the
+    numbers of those that will have fixes, where that is known.
     """
 
     def __init__(
-        self, frame: FleetFrame, sensors: SensorsTable, epoch_unix_s: float, fleet_time_of_boot: StampS
+        self,
+        frame: FleetFrame,
+        sensors: SensorsTable,
+        epoch_unix_s: float,
+        fleet_time_of_boot: StampS,
+        receivers: Collection[int] | None = None,
     ) -> None:
         self._frame = frame
         self._sensors = sensors
         self._epoch_unix_s = epoch_unix_s
         self._fleet_time_of_boot = fleet_time_of_boot
-        self._last_preferred_s: dict[str, float] = {}
-        self._last_fix: tuple[int, ...] = ()
-        """Time, place and velocity, as sent."""
-        self._repeats = 0
-        """How often the last fix has come again, with another time."""
+        self._known_receivers = receivers
+        self._heard_s: dict[str, dict[int, float]] = {}
+        """When each message of a kind last came, by its place among them."""
         self.flavour = "other"
         """``ardupilot``, ``px4`` or ``other``, set by the owner once the autopilot is known: only ArduPilot scales
         RAW_IMU, and the sensors of each are late in their own way."""
-        self.fix_type = 0
-        """The receiver's last word on its fix."""
-        self.aided = True
-        """Whether the autopilot's own estimator is aided by positions, by its last word."""
-        self._was_aided = False
-        self.frozen = False
-        """Whether the receiver repeats a fix that its own velocity contradicts."""
         self.skipped: Counter[str] = Counter()
+        self.noted: Counter[str] = Counter()
+        self.reset()
 
     def reset(self) -> None:
         """Forget the streams seen, as after a reboot."""
-        self._last_preferred_s.clear()
-        self._last_fix, self._repeats, self.frozen = (), 0, False
+        self._heard_s.clear()
+        self._receivers = (_HeardReceiver(0), _HeardReceiver(1))
+        self._choice = ReceiverChoice(self._known_receivers)
         self.fix_type = 0
+        """The last word on its fix of the receiver that is listened to."""
         self.aided = True
+        """Whether the autopilot's own estimator is aided by positions, by its last word."""
         self._was_aided = False
+
+    @property
+    def frozen(self) -> bool:
+        """Whether a receiver repeats a fix that its own velocity contradicts."""
+        return any(receiver.frozen for receiver in self._receivers)
 
     def convert(self, message: Message, arrival_s: float) -> Sample | None:
         """The sample of a message that arrived at fleet time ``arrival_s``; ``None`` if it gives none."""
@@ -98,7 +128,8 @@ class SampleAdapter:
             return self._skip("imu: not the first one")
         if message.fields_updated & _ACCEL_AND_GYRO != _ACCEL_AND_GYRO:
             return self._skip("imu: nothing new")
-        self._last_preferred_s["imu"] = arrival_s
+        if not self._serves("imu", 0, arrival_s):
+            return None
         force = (message.xacc, message.yacc, message.zacc)
         turn = (message.xgyro, message.ygyro, message.zgyro)
         return self._imu(message.time_usec, force, turn, arrival_s)
@@ -106,22 +137,26 @@ class SampleAdapter:
     def _raw_imu(self, message: Message, arrival_s: float) -> Sample | None:
         if self.flavour != "ardupilot":
             return self._skip("imu: RAW_IMU unscaled")
-        if not self._is_second_choice_due("imu", arrival_s) or message.id:
+        if message.id:
+            return self._skip("imu: not the first one")
+        if not self._serves("imu", 1, arrival_s):
             return None
-        force = (
-            message.xacc * MILLI_G_MPS2,
-            message.yacc * MILLI_G_MPS2,
-            message.zacc * MILLI_G_MPS2,
-        )
-        turn = (message.xgyro * 1e-3, message.ygyro * 1e-3, message.zgyro * 1e-3)
-        return self._imu(message.time_usec, force, turn, arrival_s)
+        return self._imu(message.time_usec, *_in_thousandths(message), arrival_s)
 
-    def _imu(self, time_usec: int, force: Triple, turn: Triple, arrival_s: float) -> Sample | None:
+    def _scaled_imu(self, message: Message, arrival_s: float) -> Sample | None:
+        """SCALED_IMU, SCALED_IMU2 and 3: the autopilot's first, second and third one."""
+        if not self._serves("imu", 2 + _SCALED_IMUS.index(message.get_msgId()), arrival_s):
+            return None
+        return self._imu(message.time_boot_ms * 1000, *_in_thousandths(message), arrival_s, WRAP_MS_S)
+
+    def _imu(
+        self, time_usec: int, force: Triple, turn: Triple, arrival_s: float, wrap_s: float = WRAP_US_S
+    ) -> Sample | None:
         if not _finite(*force, *turn):
             return self._skip("imu: not finite")
         if max(map(abs, force)) > MAX_FORCE_MPS2 or max(map(abs, turn)) > MAX_TURN_RADPS:
             return self._skip("imu: out of range")
-        t_s = self._stamp(time_usec, arrival_s, "imu")
+        t_s = self._stamp(time_usec, arrival_s, "imu", wrap_s)
         return None if t_s is None else ImuSample(t_s - imu_latency_s(self.flavour, self._sensors), force, turn)
 
     def _attitude_quaternion(self, message: Message, arrival_s: float) -> Sample | None:
@@ -129,16 +164,17 @@ class SampleAdapter:
         quaternion = normalised((message.q1, message.q2, message.q3, message.q4))
         if quaternion is None:
             return self._skip("attitude: no unit quaternion")
-        self._last_preferred_s["attitude"] = arrival_s
-        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
+        if not self._serves("attitude", 0, arrival_s):
+            return None
+        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude", WRAP_MS_S)
         return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
 
     def _attitude(self, message: Message, arrival_s: float) -> Sample | None:
-        if not self._is_second_choice_due("attitude", arrival_s):
-            return None
         if not _finite(message.roll, message.pitch, message.yaw):
             return self._skip("attitude: not finite")
-        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude")
+        if not self._serves("attitude", 1, arrival_s):
+            return None
+        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude", WRAP_MS_S)
         quaternion = from_euler(message.roll, message.pitch, message.yaw)
         return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
 
@@ -152,29 +188,47 @@ class SampleAdapter:
     # --- GPS -----------------------------------------------------------------------------------------------
 
     def _gps_raw_int(self, message: Message, arrival_s: float) -> Sample | None:
-        self.fix_type = message.fix_type
-        if not self._sensors.gps_min_fix <= message.fix_type <= mavlink.GPS_FIX_TYPE_PPP:
-            return self._skip("gps: no fix")
+        return self._gps(message, arrival_s, self._receivers[0])
+
+    def _gps2_raw(self, message: Message, arrival_s: float) -> Sample | None:
+        return self._gps(message, arrival_s, self._receivers[1])
+
+    def _gps(self, message: Message, arrival_s: float, receiver: _HeardReceiver) -> Sample | None:
+        """The fix of a receiver, if it is the one to be listened to."""
         fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
-        if message.time_usec and fix == self._last_fix:
+        lost = not self._has_fix(message)  # ArduPilot says so with the time and place of the last one
+        if not lost and message.time_usec and fix == receiver.last_fix:
             return self._skip("gps: sent again")
+        sample = self._no_fix("gps: no fix") if lost else self._fix(message, arrival_s, receiver)
+        if sample is None:
+            self._choice.without_fix(receiver.number)
+            self.fix_type = self.fix_type if receiver.number else message.fix_type
+            return None
+        if not self._choice.takes(receiver.number, arrival_s):
+            return self._skip("gps: not the first one")
+        self.fix_type = message.fix_type
+        return sample
+
+    def _has_fix(self, message: Message) -> bool:
+        return self._sensors.gps_min_fix <= int(message.fix_type) <= int(mavlink.GPS_FIX_TYPE_PPP)
+
+    def _fix(self, message: Message, arrival_s: float, receiver: _HeardReceiver) -> GpsSample | None:
         if not (abs(message.lat) <= 900_000_000 and abs(message.lon) <= 1_800_000_000) or (
             message.lat == 0 and message.lon == 0
         ):
-            return self._skip("gps: no position")
+            return self._no_fix("gps: no position")
         height = self._frame.height(message.alt * 1e-3, message.alt_ellipsoid * 1e-3 or None)
         if height is None:
-            return self._skip("gps: no height of the fleet's sort")
+            return self._no_fix("gps: no height of the fleet's sort")
         horizontal = self._accuracy_m(message.h_acc, message.eph)
         vertical = self._accuracy_m(message.v_acc, message.epv)
         if horizontal is None:
-            return self._skip("gps: no accuracy")
-        # PX4 sends time 0 while its receiver does not know UTC: then arrival is all there is.
-        t_s = self._stamp(message.time_usec, arrival_s, "gps") if message.time_usec else arrival_s
+            return self._no_fix("gps: no accuracy")
+        t_s, kind = self._fix_time(message.time_usec, arrival_s, receiver)
         if t_s is None:
             return None
-        if self._is_frozen(fix, message):  # of what is refused for another reason, nothing is remembered
-            return self._skip("gps: frozen")
+        if self._is_frozen(message, receiver):  # of what is refused for another reason, nothing is remembered
+            return self._no_fix("gps: frozen")
         ground, norm = self._speeds(message)
         return GpsSample(
             t_s=t_s,
@@ -185,16 +239,35 @@ class SampleAdapter:
             speed_mps=norm,
             speed_sigma_mps=message.vel_acc * 1e-3 or GPS_SPEED_SIGMA_MPS,
             fix_type=message.fix_type,
-            latency=gps_prior(self.flavour, _stamp_kind(message.time_usec), self._sensors),
+            latency=gps_prior(self.flavour, kind, self._sensors),
         )
 
-    def _is_frozen(self, fix: tuple[int, ...], message: Message) -> bool:
+    def _fix_time(self, time_usec: int, arrival_s: float, receiver: _HeardReceiver) -> tuple[float | None, Stamp]:
+        """Fleet time of a fix, and what it is of; ``None``, and counted, if it is unknown or cannot be true."""
+        if not time_usec:  # PX4 sends time 0 while its receiver does not know UTC: then arrival is all there is
+            return arrival_s, "arrival"
+        if time_usec <= UNIX_US:
+            return self._stamp(time_usec, arrival_s, "gps", WRAP_US_S), "boot"
+        arrival_unix_s = arrival_s + self._epoch_unix_s
+        unix_s = unrolled(time_usec * 1e-6, arrival_unix_s)
+        if abs(unix_s - time_usec * 1e-6) > 1.0:
+            self.noted["fixes whose weeks have rolled over"] += 1
+        shift_s = receiver.utc.shift_s(unix_s, arrival_unix_s)
+        if shift_s == 0.0:
+            return self._plausible(unix_s - self._epoch_unix_s, arrival_s, "gps"), "utc"
+        self.noted["fixes placed by arrival, as their UTC and our clock differ"] += 1
+        if shift_s is None:
+            return arrival_s, "arrival"
+        return self._plausible(unix_s + shift_s - self._epoch_unix_s, arrival_s, "gps"), "arrival"
+
+    def _is_frozen(self, message: Message, receiver: _HeardReceiver) -> bool:
         """Whether the receiver repeats itself though it says that it moves; remembers the fix."""
-        self._repeats = self._repeats + 1 if fix[1:] == self._last_fix[1:] else 0
-        self._last_fix = fix
+        fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
+        receiver.repeats = receiver.repeats + 1 if fix[1:] == receiver.last_fix[1:] else 0
+        receiver.last_fix = fix
         moves = message.vel != UNKNOWN_16 and message.vel * 1e-2 > MOVING_MPS
-        self.frozen = moves and self._repeats >= FROZEN_FIXES - 1
-        return self.frozen
+        receiver.frozen = moves and receiver.repeats >= FROZEN_FIXES - 1
+        return receiver.frozen
 
     def _accuracy_m(self, accuracy_mm: int, dilution_centi: int) -> float | None:
         """1-sigma in m: the receiver's own, else from the dilution of precision (which is not metres).
@@ -227,37 +300,59 @@ class SampleAdapter:
         velocity = (message.vx, message.vy, message.vz)
         if not _finite(*position, *velocity):
             return self._skip("local position: not finite")
-        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "local position")
+        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "local position", WRAP_MS_S)
         return None if t_s is None else AutopilotEstimate(t_s, position, velocity)
 
     # --- common --------------------------------------------------------------------------------------------
 
-    def _is_second_choice_due(self, kind: str, arrival_s: float) -> bool:
-        return arrival_s - self._last_preferred_s.get(kind, -math.inf) > PREFERENCE_HOLD_S
+    def _serves(self, kind: str, place: int, arrival_s: float) -> bool:
+        """Whether a message is the best of its kind that comes of late; ``place`` is its place among them."""
+        heard_s = self._heard_s.setdefault(kind, {})
+        heard_s[place] = arrival_s
+        if any(better < place and arrival_s - at_s <= PREFERENCE_HOLD_S for better, at_s in heard_s.items()):
+            self.skipped[f"{kind}: a better one comes"] += 1
+            return False
+        return True
 
-    def _stamp(self, time_usec: int, arrival_s: float, kind: str) -> float | None:
-        """Fleet time of a stamp; ``None``, and counted, if it is unknown or cannot be true."""
+    def _stamp(self, time_usec: int, arrival_s: float, kind: str, wrap_s: float) -> float | None:
+        """Fleet time of a stamp; ``None``, and counted, if it is unknown or cannot be true.
+
+        A stamp of the boot clock begins anew every ``wrap_s``, if its sender has it so.
+        """
         if time_usec > UNIX_US:
-            t_s: float | None = time_usec * 1e-6 - self._epoch_unix_s
-        else:
-            t_s = self._fleet_time_of_boot(time_usec * 1e-6, arrival_s)
+            return self._plausible(time_usec * 1e-6 - self._epoch_unix_s, arrival_s, kind)
+        boot_s = time_usec * 1e-6
+        t_s = self._fleet_time_of_boot(boot_s, arrival_s)
         if t_s is None:
             self.skipped[f"{kind}: clock unknown"] += 1
             return None
-        if not -MAX_STAMP_LEAD_S <= arrival_s - t_s <= MAX_STAMP_AGE_S:
-            self.skipped[f"{kind}: wrong time"] += 1
-            return None
-        return t_s
+        begun = turns(t_s, arrival_s, wrap_s, wrap_s / 4)  # over a turn, what is known of the drift says little
+        if begun:
+            t_s = self._fleet_time_of_boot(boot_s + begun * wrap_s, arrival_s)
+            assert t_s is not None  # it was known above
+        return self._plausible(t_s, arrival_s, kind)
+
+    def _plausible(self, t_s: float, arrival_s: float, kind: str) -> float | None:
+        """A fleet time, unless it cannot be true: then it is counted."""
+        if -MAX_STAMP_LEAD_S <= arrival_s - t_s <= MAX_STAMP_AGE_S:
+            return t_s
+        self.skipped[f"{kind}: wrong time"] += 1
+        return None
+
+    def _no_fix(self, reason: str) -> GpsSample | None:
+        self.skipped[reason] += 1
+        return None
 
     def _skip(self, reason: str) -> Sample | None:
         self.skipped[reason] += 1
         return None
 
 
-def _stamp_kind(time_usec: int) -> Stamp:
-    if not time_usec:
-        return "arrival"
-    return "utc" if time_usec > UNIX_US else "boot"
+def _in_thousandths(message: Message) -> tuple[Triple, Triple]:
+    """Specific force in m/s2 and turn rate in rad/s of a message in thousandths of g and rad/s."""
+    x, y, z = (value * MILLI_G_MPS2 for value in (message.xacc, message.yacc, message.zacc))
+    p, q, r = (value * 1e-3 for value in (message.xgyro, message.ygyro, message.zgyro))
+    return (x, y, z), (p, q, r)
 
 
 def _finite(*values: float) -> bool:
@@ -267,9 +362,11 @@ def _finite(*values: float) -> bool:
 _CONVERTERS: dict[int, Callable[[SampleAdapter, Message, float], Sample | None]] = {
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: SampleAdapter._highres_imu,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: SampleAdapter._raw_imu,
+    **dict.fromkeys(_SCALED_IMUS, SampleAdapter._scaled_imu),
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: SampleAdapter._attitude_quaternion,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: SampleAdapter._attitude,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: SampleAdapter._gps_raw_int,
+    mavlink.MAVLINK_MSG_ID_GPS2_RAW: SampleAdapter._gps2_raw,
     mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: SampleAdapter._local_position_ned,
     mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS: SampleAdapter._estimator_status,
     mavlink.MAVLINK_MSG_ID_EKF_STATUS_REPORT: SampleAdapter._estimator_status,

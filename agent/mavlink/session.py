@@ -11,7 +11,16 @@ from dataclasses import dataclass
 from enum import StrEnum
 
 from agent.config.tables import FleetConfig
+from agent.mavlink.boot_times import WRAP_MS_S, shown_boot_s, turns
 from agent.mavlink.codec import Decoder, Encoder, Message, mavlink
+from agent.mavlink.components import (
+    AUTOPILOT_COMPONENT,
+    FLAVOURS,
+    SENSORS,
+    Standing,
+    speaks_for_vehicle,
+    standing,
+)
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.mavlink.signing import LinkSigning
 from agent.mavlink.stream_rates import StreamRates
@@ -22,15 +31,13 @@ from agent.sensing.samples import Sample
 
 HEARTBEAT_PERIOD_S = 1.0
 REBOOT_BACKWARDS_S = 1.0
-FLAVOURS = {mavlink.MAV_AUTOPILOT_PX4: "px4", mavlink.MAV_AUTOPILOT_ARDUPILOTMEGA: "ardupilot"}
-_NOT_VEHICLES = {
-    mavlink.MAV_TYPE_GCS,
-    mavlink.MAV_TYPE_ONBOARD_CONTROLLER,
-    mavlink.MAV_TYPE_GIMBAL,
-    mavlink.MAV_TYPE_ADSB,
-    mavlink.MAV_TYPE_CAMERA,
-    mavlink.MAV_TYPE_ANTENNA_TRACKER,
-}
+REBOOT_CONFIRM = 3
+"""So many stamps in a row that agree are of a new clock; a single one that is behind is not."""
+AGREE_S = 1.0
+AHEAD_S = 60.0
+"""A stamp this far ahead of where the clock should be is doubted too: believed, it would put all others behind."""
+PATIENCE_S = 5.0
+"""A component that sends no sensors for so long is given up for one that does."""
 LOCAL_POSITION_HZ = 2.0
 """For comparison only, never a measurement."""
 ESTIMATOR_STATUS_HZ = 2.0
@@ -94,10 +101,19 @@ class AutopilotSession:
         self.heard = 0
         """Messages of the autopilot's system, whatever its component but our own."""
         self.reboots = 0
+        self.handovers = 0
+        """How often another component was taken for the autopilot than before."""
         self.ignored: Counter[str] = Counter()
         self._last_heartbeat_s = 0.0
         self._next_heartbeat_s = 0.0
-        self._boot_s: float | None = None
+        self._taken_s = 0.0
+        """When the autopilot was taken for one."""
+        self._sensed_s: dict[int, dict[str, float]] = {}
+        """When the components of our system last sent sensors, by kind."""
+        self._boot: tuple[float, float] | None = None
+        """The autopilot's latest boot time, and when it came."""
+        self._doubtful: list[tuple[float, float]] = []
+        """The same of the last ones that do not fit it."""
         self._someone_else_answers = False
         self._answers: list[bytes] = []
 
@@ -157,6 +173,8 @@ class AutopilotSession:
         if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._on_heartbeat(message, now_s)
             return None
+        if message_id in SENSORS and message.get_srcSystem() == self._expected_system:
+            self._sensed_s.setdefault(message.get_srcComponent(), {})[SENSORS[message_id]] = now_s
         source = (message.get_srcSystem(), message.get_srcComponent())
         if self.autopilot is None or source != (self.autopilot.system_id, self.autopilot.component_id):
             self._on_stranger(message)
@@ -168,13 +186,15 @@ class AutopilotSession:
             self._on_ack(message, now_s)
             return None
         self.rates.on_message(message_id)
-        boot_ms = getattr(message, "time_boot_ms", None)
-        if boot_ms is not None:
-            self._on_boot_time(boot_ms * 1e-3, now_s)
+        if message_id == mavlink.MAVLINK_MSG_ID_GPS2_RAW:  # there is a second receiver
+            self.rates.add(message_id, self._settings.gps_hz)
+        boot_s = shown_boot_s(message)
+        if boot_s is not None:
+            self._on_boot_time(boot_s, now_s)
         return self.samples.convert(message, self._fleet_clock.fleet_s(now_s))
 
     def _on_heartbeat(self, message: Message, now_s: float) -> None:
-        if message.autopilot == mavlink.MAV_AUTOPILOT_INVALID or message.type in _NOT_VEHICLES:
+        if not speaks_for_vehicle(message):
             return
         flavour = FLAVOURS.get(message.autopilot, "other")
         if message.get_srcSystem() != self._expected_system:
@@ -185,16 +205,43 @@ class AutopilotSession:
             return
         found = AutopilotId(message.get_srcSystem(), message.get_srcComponent(), flavour)
         if self.autopilot is not None and found.component_id != self.autopilot.component_id:
-            self.ignored["heartbeat: second autopilot component"] += 1
-            return
+            if not self._is_better(found, now_s):
+                self.ignored["heartbeat: second autopilot component"] += 1
+                return
+            self._hand_over()
         self._last_heartbeat_s = now_s
         if self.state is not LinkState.CONNECTED:
             self.autopilot = found
             self.samples.flavour = flavour
             self.state = LinkState.CONNECTED
+            self._taken_s = now_s
             self.rates.restart(now_s)
             if flavour in _ESTIMATOR_STATUS:
                 self.rates.add(_ESTIMATOR_STATUS[flavour], ESTIMATOR_STATUS_HZ)
+
+    def _is_better(self, found: AutopilotId, now_s: float) -> bool:
+        """Whether another component is rather the autopilot than the one that was taken for it."""
+        assert self.autopilot is not None
+        if self._standing(found, now_s) <= self._standing(self.autopilot, now_s):
+            return False
+        # Component 1 is it at once; to others it is handed when sensors have had the time to come.
+        return found.component_id == AUTOPILOT_COMPONENT or now_s - self._taken_s > PATIENCE_S
+
+    def _standing(self, component: AutopilotId, now_s: float) -> Standing:
+        sensed_s = self._sensed_s.get(component.component_id, {})
+        kinds = [kind for kind, at_s in sensed_s.items() if now_s - at_s <= PATIENCE_S]
+        return standing(component.component_id, kinds, (component.flavour,))
+
+    def _hand_over(self) -> None:
+        """Forget what came of the component that was taken for the autopilot."""
+        self.handovers += 1
+        self.state = LinkState.SEARCHING
+        self._forget_clock()
+
+    def _forget_clock(self) -> None:
+        self.clock.reset()
+        self.samples.reset()
+        self._boot, self._doubtful = None, []
 
     def _on_stranger(self, message: Message) -> None:
         self.ignored["other source"] += 1
@@ -218,22 +265,39 @@ class AutopilotSession:
             self._fall_back()
 
     def _fall_back(self) -> None:
-        """Ask for the second-best message where the best one is refused (older ArduPilot builds)."""
+        """Ask for the next-best message where a better one is refused (older ArduPilot builds, lean links)."""
         assert self.autopilot is not None
-        if self.autopilot.flavour == "ardupilot" and self.rates.refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU):
-            self.rates.add(mavlink.MAVLINK_MSG_ID_RAW_IMU, self._settings.imu_hz)
-        if self.rates.refused(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):
-            self.rates.add(mavlink.MAVLINK_MSG_ID_ATTITUDE, self._settings.attitude_hz)
+        refused, settings = self.rates.refused, self._settings
+        if self.autopilot.flavour == "ardupilot" and refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU):
+            self.rates.add(mavlink.MAVLINK_MSG_ID_RAW_IMU, settings.imu_hz)
+        unscaled = self.autopilot.flavour != "ardupilot" and refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU)
+        if unscaled or refused(mavlink.MAVLINK_MSG_ID_RAW_IMU):
+            self.rates.add(mavlink.MAVLINK_MSG_ID_SCALED_IMU, settings.imu_hz)
+        if refused(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):
+            self.rates.add(mavlink.MAVLINK_MSG_ID_ATTITUDE, settings.attitude_hz)
 
     def _on_boot_time(self, boot_s: float, now_s: float) -> None:
-        if self._boot_s is not None and boot_s < self._boot_s - REBOOT_BACKWARDS_S:
-            self.reboots += 1
-            self.clock.reset()
-            self.samples.reset()
-            self.rates.restart(now_s)
-            self._boot_s = boot_s
-        self._boot_s = boot_s if self._boot_s is None else max(self._boot_s, boot_s)
+        if self._boot is not None:
+            last_s, heard_s = self._boot
+            expected_s = last_s + now_s - heard_s
+            boot_s += turns(boot_s, expected_s, WRAP_MS_S) * WRAP_MS_S
+            if boot_s < last_s - REBOOT_BACKWARDS_S or boot_s > expected_s + AHEAD_S:
+                if not self._is_new_clock(boot_s, now_s):
+                    return
+                self.reboots += 1
+                self._forget_clock()
+                self.rates.restart(now_s)
+                self._boot = None
+        self._doubtful = []
+        if self._boot is None or boot_s >= self._boot[0]:
+            self._boot = boot_s, now_s
         self.clock.on_arrival(boot_s, now_s)
+
+    def _is_new_clock(self, boot_s: float, now_s: float) -> bool:
+        """Whether the last stamps that do not fit agree, as those of an autopilot that was rebooted."""
+        agreeing = [each for each in self._doubtful if abs((boot_s - each[0]) - (now_s - each[1])) <= AGREE_S]
+        self._doubtful = [*agreeing, (boot_s, now_s)]
+        return len(self._doubtful) >= REBOOT_CONFIRM
 
     def _fleet_time_of_boot(self, boot_s: float, arrival_s: float) -> float | None:
         if not self.clock.synchronised:

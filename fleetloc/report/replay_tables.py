@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from fleetloc.report.replay_figures import ALL, SETTLED
+from fleetloc.run.replay_setup import NO_PLACE
 
 SPELLED = {SETTLED: "after 10 s"}
 MOSTLY = 0.9
@@ -86,6 +87,8 @@ def fit_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 def cautions(figures: dict[str, Any]) -> list[str]:
     """What a reader of the figures must know of them."""
     sentences = []
+    if figures["origin"] == NO_PLACE:
+        sentences.append("no log tells a place: there is no origin, no home and no fix in them")
     for agent in figures["agents"]:
         if agent["first_estimate_s"] is None:
             sentences.append(f"drone {agent['id']} ({agent['log']}) never had an estimate: no fixes, or none in time")

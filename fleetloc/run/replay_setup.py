@@ -9,15 +9,17 @@ from pathlib import Path
 
 import msgspec
 
-from agent.config.documents import Override, read_document
+from agent.config.documents import Document, Override, read_document
 from agent.config.reading import config_of
-from agent.config.tables import FleetConfig
+from agent.config.tables import FleetConfig, SensorsTable
+from agent.errors import ConfigError
 from agent.log.estimate_mcap import SUFFIX as RECORD_SUFFIX
 from agent.sensing.frames import FleetFrame
 from fleetloc.errors import InputError
 from sim_bridge.replay.feed import Inputs
 from sim_bridge.replay.injection import Injection, parsed_faults
-from sim_bridge.replay.logs.events import LogSource, TruthSample
+from sim_bridge.replay.logs.events import LogError, LogSource, TruthSample
+from sim_bridge.replay.logs.frames import frame_about, origin_of
 from sim_bridge.replay.logs.opening import open_log
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan, make_plan
@@ -31,6 +33,8 @@ from sim_bridge.replay.what_if import GpsDrop, GpsDrops, ReplaySpan
 SYNTHETIC = "synthetic"
 LOGGED, STAMPED = "logged", "stamped"
 AUTO = "auto"
+NO_PLACE = "none: no log tells a place"
+"""Where the origin is from, if it is from nowhere."""
 TRUTH_SUFFIXES = (".csv", ".csv.gz")
 
 
@@ -131,7 +135,7 @@ def prepare(options: Options) -> Prepared:
 
 
 def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], str]:
-    """The configuration, completed by the origin of the first log where it names none, and the opened logs."""
+    """The configuration, completed by the origin of the logs where it names none, and the opened logs."""
     document = read_document(options.config)
     document = document.overridden(options.settings)
     fleet = document.tables.get("fleet")
@@ -141,15 +145,31 @@ def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], st
         # the sensors' settings decide what counts as a first fix: a look at the file with any origin comes first
         anywhere = {"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0}
         sensors = config_of(document.with_table("fleet", {**fleet, "origin": anywhere})).sensors
-        first = open_log(options.logs[0], frame=None, sensors=sensors)
-        first.survey()
-        frame = first.frame
-        origin = {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m}
-        config = config_of(document.with_table("fleet", {**fleet, "origin": origin}))
-        origin_from = f"log {options.logs[0].name}"
+        config, origin_from = _with_origin_of_logs(document, options.logs, sensors)
     frame = FleetFrame.of(config)
     sources = surveyed([open_log(path, frame=frame, sensors=config.sensors) for path in options.logs])
     return config, sources, origin_from
+
+
+def _with_origin_of_logs(document: Document, logs: Sequence[Path], sensors: SensorsTable) -> tuple[FleetConfig, str]:
+    """The configuration with the origin of the first log that tells a place, and how the report names that.
+
+    Raises `LogError` if it is one that no configuration can have.
+    """
+    for path in logs:
+        source = open_log(path, frame=None, sensors=sensors)
+        if origin_of(source.survey().systems.values()) is not None:
+            frame, origin_from = source.frame, f"log {path.name}"
+            break
+    else:
+        path, frame, origin_from = logs[0], frame_about(()), NO_PLACE
+    origin = {"lat_deg": frame.lat_deg, "lon_deg": frame.lon_deg, "alt_m": frame.alt_m}
+    try:
+        return config_of(document.with_table("fleet", {**document.tables["fleet"], "origin": origin})), origin_from
+    except ConfigError as error:
+        if not error.key.startswith("fleet.origin"):
+            raise
+        raise LogError(path, f"a place to begin at with {error.key}: {error.expected}", error.found) from None
 
 
 def _with_epoch(config: FleetConfig, plan: ReplayPlan) -> FleetConfig:

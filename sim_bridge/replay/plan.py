@@ -7,6 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from agent.config.tables import FleetConfig
+from agent.mavlink.utc_stamps import ROLLOVER_S
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.events import LogSource, LogSurvey, SystemSurvey
 from sim_bridge.replay.naming import names_apart
@@ -14,6 +15,7 @@ from sim_bridge.replay.naming import names_apart
 LEAD_S = 10.0
 """Fleet time of the earliest log's beginning: a time of zero would leave no room for stamps before it."""
 KNOWN_BY = {"gps": "GPS time", "host": "host's clock"}
+WEEK_S = 604_800.0
 APART_S = 6 * 3600.0
 """Logs whose beginnings lie further apart are not of one flight."""
 
@@ -103,7 +105,18 @@ def _assigned(config: FleetConfig, system_ids: list[int]) -> list[int]:
     )
 
 
-def _unix_zeros(surveys: Mapping[int, LogSurvey]) -> dict[int, float]:
+def _rolled_over_s(surveys: Mapping[int, LogSurvey]) -> dict[int, float]:
+    """What the week of a log's receiver lacks to the latest log, if it is turns of it and no more.
+
+    A receiver that misses that its ten bits began anew is 1024 weeks behind.
+    """
+    begins_s = {k: survey.unix.at(survey.first_s) for k, survey in surveys.items()}
+    latest_s = max(begins_s.values(), default=0.0)
+    turns_s = {k: ROLLOVER_S * round((latest_s - begin_s) / ROLLOVER_S) for k, begin_s in begins_s.items()}
+    return {k: turn_s if latest_s - begins_s[k] - turn_s <= APART_S else 0.0 for k, turn_s in turns_s.items()}
+
+
+def _unix_zeros(surveys: Mapping[int, LogSurvey], rolled_s: Mapping[int, float]) -> dict[int, float]:
     """Unix time less log time of each log, at one Unix instant in the middle of them all.
 
     Clocks of simulators run slow by up to 2 %: laid side by side at their boots, logs would be apart in flight. Away
@@ -111,7 +124,7 @@ def _unix_zeros(surveys: Mapping[int, LogSurvey]) -> dict[int, float]:
     """
     if not surveys:
         return {}
-    lines = {k: (survey.unix.unix_s, 1.0 + survey.unix.drift) for k, survey in surveys.items()}
+    lines = {k: (survey.unix.unix_s + rolled_s[k], 1.0 + survey.unix.drift) for k, survey in surveys.items()}
     middles_s = [lines[k][0] + lines[k][1] * (s.first_s + s.last_s) / 2 for k, s in surveys.items()]
     instant_s = sum(middles_s) / len(middles_s)
     return {k: instant_s - (instant_s - unix_s) / rate for k, (unix_s, rate) in lines.items()}
@@ -122,7 +135,8 @@ def _aligned(
 ) -> tuple[list[float], float | None, str]:
     """Time of log time 0 of each log on one clock, the epoch of that clock, and how it was found."""
     told = {k: survey for k, survey in enumerate(surveys) if survey.unix.known_by != "unknown"}
-    known = {k: (zero_s, KNOWN_BY[told[k].unix.known_by]) for k, zero_s in _unix_zeros(told).items()}
+    rolled_s = _rolled_over_s(told)
+    known = {k: (zero_s, KNOWN_BY[told[k].unix.known_by]) for k, zero_s in _unix_zeros(told, rolled_s).items()}
     known |= {k: (zero_s, "truth file") for k, zero_s in better.items()}
     if not known:
         zeros = [-survey.first_s for survey in surveys]
@@ -138,5 +152,6 @@ def _aligned(
             raise ReplayError(sources[k].path, "a log of the same flight", found)
         zeros.append(zero)
         sigma = f" +- {survey.unix.sigma_s:.3f} s" if by in ("GPS time", "host's clock") else ""
-        how.append(f"{names[sources[k].path]}: {by}{sigma}")
+        rolled = f", {rolled_s[k] / WEEK_S:.0f} weeks added" if rolled_s.get(k) and by == "GPS time" else ""
+        how.append(f"{names[sources[k].path]}: {by}{sigma}{rolled}")
     return zeros, 0.0, "; ".join(how)

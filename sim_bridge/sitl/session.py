@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from agent.config.tables import FleetConfig
 from agent.mavlink.codec import Decoder, Encoder, Message, mavlink
-from agent.mavlink.session import FLAVOURS
+from agent.mavlink.components import FLAVOURS
 from agent.mavlink.stream_rates import StreamRates
 from agent.mavlink.timesync import BootClock
 from agent.sensing.frames import FleetFrame

@@ -95,7 +95,7 @@ class VirtualAutopilot:
         return out
 
     def stream(self, message_id: int, boot_s: float) -> None:
-        ms, us = int(boot_s * 1e3), int(boot_s * 1e6)
+        ms, us = int(boot_s * 1e3) % 2**32, int(boot_s * 1e6)
         if message_id == 0:
             self.send(mavlink.MAVLink_heartbeat_message(2, self.autopilot, 0, 0, 4, 3))
         elif message_id == HIGHRES:

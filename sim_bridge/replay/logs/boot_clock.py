@@ -14,6 +14,8 @@ from bisect import bisect_right
 from dataclasses import dataclass, field
 from itertools import pairwise
 
+from agent.mavlink.boot_times import WRAP_MS_S, turns
+
 MAX_POINTS = 4096
 """Lowest differences kept per boot; a longer log keeps them coarser."""
 FINEST_BUCKET_S = 0.25
@@ -109,9 +111,13 @@ class _Boot:
 
 
 class BootClockFit:
-    """Takes boot times with their arrivals in the order of arrival, makes `BootSession` of them."""
+    """Takes boot times with their arrivals in the order of arrival, makes `BootSession` of them.
 
-    def __init__(self) -> None:
+    The boot times begin anew every ``wrap_s``, which is no reboot.
+    """
+
+    def __init__(self, wrap_s: float = WRAP_MS_S) -> None:
+        self._wrap_s = wrap_s
         self._boots: list[_Boot] = []
         self._top_s = 0.0
         self._low: Point = (0.0, 0.0)
@@ -125,6 +131,7 @@ class BootClockFit:
 
     def add(self, boot_s: float, arrival_s: float) -> None:
         """Take in that a message stamped ``boot_s`` was there at log time ``arrival_s``."""
+        boot_s += turns(boot_s, arrival_s - self._low[1], self._wrap_s) * self._wrap_s if self._boots else 0.0
         if not self._boots:
             self._begin(boot_s, arrival_s)
         elif not self._belongs(boot_s, arrival_s):
@@ -133,6 +140,11 @@ class BootClockFit:
         self.refused += len(self._suspects)
         self._suspects.clear()
         self._take(boot_s, arrival_s)
+
+    @property
+    def heard(self) -> bool:
+        """Whether any boot time was taken in."""
+        return bool(self._boots)
 
     def sessions(self) -> list[BootSession]:
         """The boots in their order; none if nothing was taken in."""
@@ -200,6 +212,12 @@ class LogBootClock:
         """Log time of a boot time that arrived at ``arrival_s``; ``None`` if no boot time was ever heard."""
         place = self.session(arrival_s)
         return None if place < 0 else self._sessions[place].log_s(boot_s)
+
+    def unwrapped_s(self, boot_s: float, arrival_s: float, wrap_s: float) -> float | None:
+        """The same of a boot time that begins anew every ``wrap_s``."""
+        t_s = self.log_s(boot_s, arrival_s)
+        begun = 0 if t_s is None else turns(t_s, arrival_s, wrap_s, wrap_s / 4)
+        return self.log_s(boot_s + begun * wrap_s, arrival_s) if begun else t_s
 
 
 def _difference(point: Point) -> float:

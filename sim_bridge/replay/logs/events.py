@@ -5,7 +5,7 @@
 ========== ================================================================= ==========================
 format     log time 0                                                        shared by
 ========== ================================================================= ==========================
-tlog       the first stamp of the ground station                             all systems in the file
+tlog       the first stamp of the ground station; at the vehicle's pace      all systems in the file
 dataflash  boot of the autopilot                                             one vehicle
 ulog       boot of the autopilot                                             one vehicle
 ========== ================================================================= ==========================
@@ -130,6 +130,8 @@ class SystemSurvey:
     estimate_frame: Literal["fleet", "own", "none"]
     truth_from: str | None
     """The message that holds the simulator's truth; absent on real flights."""
+    receivers: tuple[int, ...] = (0,)
+    """The GNSS receivers that had fixes, by number from 0."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -40,6 +40,8 @@ class ReceiverFix:
     course_rad: float | None
     down_mps: float | None
     speed_sigma_mps: float | None
+    ground_velocity_mps: tuple[float, float] | None = None
+    """North and east, where the receiver gives them; surer than speed and course."""
 
 
 def gps_sample(fix: ReceiverFix, frame: FleetFrame, flavour: str, sensors: SensorsTable) -> GpsSample | str:
@@ -96,6 +98,11 @@ def _sigma_m(accuracy_m: float | None, dilution: float | None) -> float | None:
 def _speeds(fix: ReceiverFix, sensors: SensorsTable) -> tuple[tuple[float, float] | None, float | None]:
     """Ground velocity, or norm of the velocity, whichever the configuration takes."""
     speed, course, down = fix.speed_mps, fix.course_rad, fix.down_mps
+    ground = fix.ground_velocity_mps
+    if ground is not None and all(map(math.isfinite, ground)) and sensors.gps_speed != "off":
+        if sensors.gps_speed == "horizontal":
+            return ground, None
+        speed = math.hypot(*ground)
     if sensors.gps_speed == "off" or speed is None or not math.isfinite(speed):
         return None, None
     if sensors.gps_speed == "norm":

@@ -2,17 +2,28 @@
 
 from __future__ import annotations
 
+import calendar
 import math
+from bisect import bisect_right
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from agent.mavlink.utc_stamps import ROLLOVER_S
 from sim_bridge.replay.logs.events import UnixZero
 
 GPS_EPOCH_UNIX_S = 315_964_800
 WEEK_S = 604_800
-LEAP_SECONDS = 18
-"""GPS minus UTC since 2017; earlier leap seconds would put an older log at most a few seconds off."""
+LEAPS_UNIX_S = tuple(
+    calendar.timegm((year, month, 1, 0, 0, 0))
+    for year, month in (
+        (1981, 7), (1982, 7), (1983, 7), (1985, 7), (1988, 1), (1990, 1), (1991, 1), (1992, 7), (1993, 7), (1994, 7),
+        (1996, 1), (1997, 7), (1999, 1), (2006, 1), (2009, 1), (2012, 7), (2015, 7), (2017, 1),
+    )
+)  # fmt: skip
+"""When UTC fell a second further behind GPS time (IERS Bulletin C)."""
+EARLIEST_UNIX_S = 1_262_304_000
+"""Start of 2010: no autopilot logged before it, so that an earlier week is one that has rolled over."""
 RECEIVER_LATENCY_SIGMA_S = 0.1
 """Fixes are logged 0.05 to 0.25 s after their instant, which the fit cannot see."""
 FEWEST = 2
@@ -23,8 +34,15 @@ KEPT = 2048
 
 
 def unix_of_week(week: int, of_week_ms: int) -> float:
-    """Unix time of a GPS week and the milliseconds of it."""
-    return GPS_EPOCH_UNIX_S + week * WEEK_S + of_week_ms * 1e-3 - LEAP_SECONDS
+    """Unix time of a GPS week and the milliseconds of it, with the leap seconds of that date."""
+    gps_s = since_earliest(GPS_EPOCH_UNIX_S + week * WEEK_S + of_week_ms * 1e-3)
+    leaps = bisect_right([unix_s + count for count, unix_s in enumerate(LEAPS_UNIX_S, 1)], gps_s)
+    return gps_s - leaps
+
+
+def since_earliest(unix_s: float) -> float:
+    """A time of a receiver with as many turns of its week as make it later than all autopilots."""
+    return unix_s + ROLLOVER_S * max(math.ceil((EARLIEST_UNIX_S - unix_s) / ROLLOVER_S), 0)
 
 
 @dataclass(slots=True)

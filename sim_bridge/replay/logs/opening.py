@@ -36,8 +36,24 @@ def open_log(path: Path, *, frame: FleetFrame | None, sensors: SensorsTable) -> 
     if FORMAT_OF_FORMAT in head:
         return DataflashSource(path, frame, sensors)
     if _holds_frames(head):
+        if _without_stamps(head):
+            raise LogError(path, "frames with time stamps (the .tlog beside it)", "frames without any (a .tlog.raw?)")
         return TlogSource(path, frame, sensors)
     raise LogError(path, _EXPECTED, f"{len(head)} bytes of something else, beginning {head[:8]!r}")
+
+
+def _without_stamps(head: bytes) -> bool:
+    """Whether most frames follow each other at once, without the room that a stamp takes (``mav.tlog.raw``)."""
+    at_once = stamped = at = 0
+    while at < len(head):
+        end = at + is_frame(head, at) if head[at] in (V1, V2) else at
+        if end == at:
+            at += 1
+            continue
+        at_once += is_frame(head, end) > 0
+        stamped += is_frame(head, end + STAMP_BYTES) > 0
+        at = end
+    return at_once > stamped
 
 
 def _holds_frames(head: bytes) -> bool:

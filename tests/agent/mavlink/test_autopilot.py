@@ -124,6 +124,7 @@ def test_raw_imu_is_asked_for_where_highres_imu_is_refused(bench: Callable[..., 
     px4 = bench(refuses=(HIGHRES,))
     px4.run(5)
     assert RAW not in px4.autopilot.rates
+    assert mavlink.MAVLINK_MSG_ID_SCALED_IMU in [message_id for message_id, _ in px4.autopilot.commands]
 
 
 def test_requests_without_answer_are_repeated_three_times_and_then_the_next_is_tried(
@@ -173,6 +174,64 @@ def test_a_reboot_is_seen_and_times_are_right_again(bench: Callable[..., Bench])
     assert b.session.reboots == 1
     assert b.of(ImuSample)[-1].t_s == pytest.approx(b.now_s, abs=2e-3)
     assert all(abs(sample.t_s - b.now_s) < 6 for sample in b.samples)
+
+
+def test_a_boot_clock_in_milliseconds_that_begins_anew_is_no_reboot(bench: Callable[..., Bench]) -> None:
+    b = bench(boot_s=95.0 - 2**32 * 1e-3)  # its milliseconds wrap at 95 s
+    b.now_s = 93.0
+    b.run(8)
+    assert b.session.reboots == 0
+    assert b.of(AttitudeSample)[-1].t_s == pytest.approx(b.now_s, abs=0.03)  # they come every 0.02 s
+    assert len(b.of(AttitudeSample)) > 350
+
+
+@pytest.mark.parametrize("wrong_ms", [0, 2**32 - 1])
+def test_a_single_stamp_that_is_wrong_is_no_reboot(bench: Callable[..., Bench], wrong_ms: int) -> None:
+    b = bench()
+    b.run(3)
+    for _ in range(4):
+        wrong = mavlink.MAVLink_attitude_quaternion_message(wrong_ms, 1, 0, 0, 0, 0, 0, 0)
+        assert b.session.receive(b.autopilot.encoder.encode(wrong), b.now_s) == []
+        b.run(1)
+    assert b.session.reboots == 0
+
+
+def component(number: int, kind: int = 2, autopilot: int = ARDUPILOT) -> Callable[..., bytes]:
+    """A component of system 1 that says what it is, or sends a message."""
+    encoder = Encoder(1, number)
+    beat = mavlink.MAVLink_heartbeat_message(kind, autopilot, 0, 0, 4, 3)
+    return lambda message=None: encoder.encode(beat if message is None else message)
+
+
+def test_a_companion_that_says_it_is_the_vehicle_is_not_taken_while_the_autopilot_has_sensors(
+    bench: Callable[..., Bench],
+) -> None:
+    b = bench()
+    b.run(3)
+    companion = component(191, autopilot=PX4)
+    for _ in range(20):
+        b.session.receive(companion(), b.now_s)
+        b.session.receive(companion(mavlink.MAVLink_attitude_message(5000, 0, 0, 0, 0, 0, 0)), b.now_s)
+        b.run(0.5)
+    assert b.session.autopilot is not None
+    assert b.session.autopilot.component_id == 1
+    assert b.session.handovers == 0
+
+
+def test_a_component_without_sensors_is_given_up_for_one_that_has_some(bench: Callable[..., Bench]) -> None:
+    """GIVEN an autopilot under an unusual component id, and a payload that was heard before."""
+    b = bench()
+    payload, autopilot = component(100), component(7)
+    for step in range(200):
+        now_s = 100.0 + 0.05 * step
+        b.session.receive(payload(), now_s)
+        b.session.receive(autopilot(), now_s)
+        fix = mavlink.MAVLink_gps_raw_int_message(
+            round(5e6 + 5e4 * step), 3, 470_000_000, 80_000_000, 400_000, 80, 120, 0, 0, 12
+        )
+        b.session.receive(autopilot(fix), now_s)
+    assert b.session.autopilot is not None
+    assert b.session.autopilot.component_id == 7
 
 
 def test_timesync_requests_are_answered_with_the_monotonic_clock(bench: Callable[..., Bench]) -> None:

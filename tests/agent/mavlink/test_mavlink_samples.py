@@ -240,10 +240,88 @@ def test_the_autopilots_own_position_is_never_a_measurement() -> None:
     assert isinstance(convert(made, local), AutopilotEstimate)
     for message in (
         mavlink.MAVLink_global_position_int_message(99_990, 470000000, 80000000, 1, 2, 3, 4, 5, 6),
-        mavlink.MAVLink_gps2_raw_message(99_900_000, 3, 470001000, 80002000, 412_500, 80, 120, 5, 0, 9, 0, 0),
         mavlink.MAVLink_vfr_hud_message(1, 2, 3, 4, 5, 6),
     ):
         assert convert(made, message) is None
+
+
+def gps2(**changed: Any) -> Any:
+    fields: dict[str, Any] = {
+        "time_usec": 99_900_000, "fix_type": 3, "lat": 470003000, "lon": 80002000, "alt": 412_500, "eph": 80,
+        "epv": 120, "vel": 500, "cog": 9000, "satellites_visible": 14, "dgps_numch": 0, "dgps_age": 0, "h_acc": 300,
+    }  # fmt: skip
+    return mavlink.MAVLink_gps2_raw_message(**{**fields, **changed})
+
+
+def test_the_second_receiver_serves_while_the_first_has_no_fix() -> None:
+    made = adapter()
+    assert convert(made, gps()) is not None
+    assert convert(made, gps2()) is None
+    assert made.skipped == {"gps: not the first one": 1}
+    assert convert(made, gps(fix_type=1)) is None
+    second = convert(made, gps2(time_usec=99_950_000))
+    assert second.position_m[0] == pytest.approx(FRAME.ned(47.0003, 8.0002, 412.5)[0], abs=1e-6)
+    assert made.fix_type == 3
+    assert convert(made, gps(time_usec=99_960_000)) is not None
+    assert convert(made, gps2(time_usec=99_970_000)) is None
+
+
+def test_the_second_receiver_serves_once_the_first_was_silent_for_long() -> None:
+    made = adapter()
+    served = [
+        convert(made, gps2(time_usec=99_900_000 + 200_000 * k, lat=470_003_000 + k), ARRIVAL_S + 0.2 * k)
+        for k in range(20)
+    ]
+    assert [each is not None for each in served].index(True) == 13
+    assert all(each is not None for each in served[13:])
+
+
+def scaled_imu(number: int = 1, boot_ms: int = 99_990) -> Any:
+    make = {
+        1: mavlink.MAVLink_scaled_imu_message,
+        2: mavlink.MAVLink_scaled_imu2_message,
+        3: mavlink.MAVLink_scaled_imu3_message,
+    }[number]
+    return make(boot_ms, 100, -50, -1000 + number, 10, -20, 30, 0, 0, 0)
+
+
+def test_the_best_imu_that_comes_is_used() -> None:
+    """GIVEN the third IMU alone, then the second, the first, and HIGHRES_IMU THEN each takes over at once."""
+    made = adapter()
+    for message in (scaled_imu(3), scaled_imu(2), scaled_imu(1), highres()):
+        assert isinstance(convert(made, message), ImuSample)
+    for message in (scaled_imu(1), scaled_imu(2), scaled_imu(3)):
+        assert convert(made, message) is None
+    assert made.skipped == {"imu: a better one comes": 3}
+    late = convert(made, scaled_imu(2, 101_000), ARRIVAL_S + 1.01)
+    assert late.specific_force_mps2 == pytest.approx((0.980665, -0.4903325, -998 * 9.80665e-3))
+
+
+@given(st.floats(1.0, 4000.0), st.integers(0, 3000))
+def test_stamps_of_32_bits_are_of_the_turn_that_fits(past_s: float, turn: int) -> None:
+    """GIVEN an autopilot up for many turns of its microseconds THEN RAW_IMU's stamp is of the present one."""
+    wrap_us = 2**32
+    offset_s = ARRIVAL_S - (turn * wrap_us * 1e-6 + past_s)
+    made = SampleAdapter(FRAME, SensorsTable(), EPOCH_UNIX_S, lambda boot_s, _: boot_s + offset_s)
+    made.flavour = "ardupilot"
+    sample = convert(made, raw_imu(round(past_s * 1e6) % wrap_us))
+    assert sample.t_s == pytest.approx(ARRIVAL_S - 0.0125, abs=1e-4)
+
+
+@pytest.mark.parametrize("days", [49.7103, 99.4206, 1000.0])
+def test_stamps_in_milliseconds_are_of_the_turn_that_fits(days: float) -> None:
+    up_s = days * 86_400.0
+    made = SampleAdapter(FRAME, SensorsTable(), EPOCH_UNIX_S, lambda boot_s, _: boot_s + ARRIVAL_S - up_s)
+    stamp_ms = round(up_s * 1e3) % 2**32
+    attitude = mavlink.MAVLink_attitude_quaternion_message(stamp_ms, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    assert convert(made, attitude).t_s == pytest.approx(ARRIVAL_S, abs=1e-3)
+
+
+def test_utc_of_a_receiver_that_missed_a_turn_of_its_week_is_understood() -> None:
+    made = adapter()
+    stamp_us = round((EPOCH_UNIX_S + 499.9 - 1024 * 604_800) * 1e6)
+    assert convert(made, gps(time_usec=stamp_us)).t_s == pytest.approx(499.9, abs=1e-5)
+    assert made.noted == {"fixes whose weeks have rolled over": 1}
 
 
 @given(st.integers(-32768, 32767), st.integers(-32768, 32767), st.integers(-32768, 32767))

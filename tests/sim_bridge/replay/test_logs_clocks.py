@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from sim_bridge.replay.logs.boot_clock import MAX_POINTS, BootClockFit, LogBootClock
 from sim_bridge.replay.logs.gps_time import GpsTimeFit, fitted, unix_of_week
 from sim_bridge.replay.logs.stamps import StampRepair, without_outliers
+from sim_bridge.replay.logs.telemetry.pace import PaceSurvey
 
 S = 1_000_000
 
@@ -181,3 +182,55 @@ def test_too_little_gps_time_is_unknown() -> None:
 def test_gps_week() -> None:
     """2017-10-29 01:46:52 UTC, eighteen leap seconds behind GPS."""
     assert unix_of_week(1973, 6_430_000) == 1_509_241_612.0
+
+
+@pytest.mark.parametrize(
+    ("week", "of_week_s", "unix_s"),
+    [
+        (1930, 18, 1_483_228_800.0),  # the first second of 2017
+        (1929, 604_800 - 1, 1_483_228_800.0 - 18.0),
+        (1851, 259_200 + 15, 1_435_708_799.0),  # one second before the leap of July 2015
+        (1982, 6_430, 1_514_684_812.0),
+    ],
+)
+def test_the_leap_seconds_are_those_of_the_date(week: int, of_week_s: int, unix_s: float) -> None:
+    assert unix_of_week(week, of_week_s * 1000) == unix_s
+
+
+@pytest.mark.parametrize("turn", [1, 2])
+def test_a_week_that_has_rolled_over_is_put_into_the_years_of_autopilots(turn: int) -> None:
+    assert unix_of_week(2238 - 1024 * turn, 1000) == unix_of_week(2238, 1000)
+
+
+@pytest.mark.parametrize("pace", [0.1, 0.3, 0.9, 1.5, 5.0])
+def test_the_pace_of_a_simulator_is_found_and_its_clock_taken(pace: float) -> None:
+    survey = PaceSurvey()
+    for step in range(4000):
+        survey.add(100.0 + pace * step * 0.01, step * 0.01)
+    found = survey.pace()
+    assert found is not None
+    assert found.mean == pytest.approx(pace, rel=0.02)
+    assert found.log_s(30.0) - found.log_s(10.0) == pytest.approx(20.0 * pace, rel=0.02)
+
+
+def test_a_simulator_of_changing_pace_that_is_rebooted_keeps_one_clock() -> None:
+    survey = PaceSurvey()
+    boot_s = 50.0
+    for step in range(6000):
+        boot_s = 1.0 if step == 3000 else boot_s + 0.01 * (0.2 if step < 2000 else 0.6)
+        survey.add(boot_s, step * 0.01)
+    found = survey.pace()
+    assert found is not None
+    logs_s = [found.log_s(0.1 * k) for k in range(600)]
+    assert logs_s == sorted(logs_s)
+    assert found.log_s(15.0) - found.log_s(5.0) == pytest.approx(2.0, abs=0.1)
+    assert found.log_s(55.0) - found.log_s(35.0) == pytest.approx(12.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("drift", "jitter_s"), [(1e-4, 0.0), (0.03, 0.01), (0.0, 1.0)])
+def test_a_vehicle_and_its_radio_are_no_slow_simulator(drift: float, jitter_s: float) -> None:
+    survey, rng = PaceSurvey(), np.random.default_rng(3)
+    arrivals_s = np.sort(0.05 * np.arange(2000) + rng.uniform(0.0, jitter_s, 2000))
+    for step, arrival_s in enumerate(arrivals_s.tolist()):
+        survey.add(7.0 + 0.05 * step * (1.0 - drift), arrival_s)
+    assert survey.pace() is None

@@ -12,7 +12,14 @@ from typing import Literal
 from agent.config.tables import SensorsTable
 from agent.sensing.frames import FleetFrame
 from sim_bridge.replay.logs.dataflash.records import RecordReader, Values, text_of
-from sim_bridge.replay.logs.dataflash.vehicle import WANTED, DataflashVehicle, GpsPairs, SimHome, point_of
+from sim_bridge.replay.logs.dataflash.vehicle import (
+    WANTED,
+    DataflashVehicle,
+    GpsPairs,
+    SimHome,
+    instance_of,
+    point_of,
+)
 from sim_bridge.replay.logs.events import (
     Format,
     GeodeticPoint,
@@ -57,7 +64,10 @@ class _Found:
     origin: GeodeticPoint | None = None
     home: GeodeticPoint | None = None
     first_fix: GeodeticPoint | None = None
-    gps_time: GpsTimeFit = field(default_factory=GpsTimeFit)
+    gps_times: dict[int, GpsTimeFit] = field(default_factory=dict)
+    """Of each receiver that had fixes."""
+    imus: Counter[int] = field(default_factory=Counter)
+    """Records of each IMU."""
 
 
 class DataflashSource(SurveyedLog):
@@ -68,12 +78,13 @@ class DataflashSource(SurveyedLog):
     def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
         super().__init__(path, frame, sensors)
         self._sim_home: GeodeticPoint | None = None
+        self._imu = 0
 
     def events(self) -> Iterator[LogEvent]:
         """The samples in the order of the log."""
         (system,) = self.survey().systems.values()
         counts = self.counts = LogCounts()
-        vehicle = DataflashVehicle(self.frame, self._sensors, system, self._sim_home, counts.skipped)
+        vehicle = DataflashVehicle(self.frame, self._sensors, system, self._sim_home, counts.skipped, self._imu)
         with closing(self._placed(counts)) as placed:
             for arrival_s, t_s, name, values in placed:
                 for sample in vehicle.samples(name, values, t_s):
@@ -106,8 +117,12 @@ class DataflashSource(SurveyedLog):
             found.first_s = arrival_s if found.first_s is None else found.first_s
             found.messages[name] += 1
             sim_home.add(name, values, t_s)
-            for fix in pairs.add(name, values, t_s):
-                _take_fix(found, fix, t_s)
+            for receiver, fix in pairs.add(name, values, t_s):
+                if fix["Status"] >= min(self._sensors.gps_min_fix, _FIX_3D):
+                    _take_fix(found, receiver, fix, t_s)
+            kind, number = instance_of(name, values)
+            if kind == "IMU":
+                found.imus[number] += 1
             if name == "ORGN":
                 _take_origin(found, values)
             elif name == "PARM" and text_of(values.get("Name")) in _SYSTEM_ID_PARAMETERS:
@@ -116,16 +131,18 @@ class DataflashSource(SurveyedLog):
         if found.first_s is None:
             raise LogError(self.path, "dataflash records with TimeUS", "none that could be read")
         self._sim_home = sim_home.point()
-        return LogSurvey(found.gps_time.unix_zero(), found.first_s, found.last_s, {found.system_id: _system(found)})
+        most = max(found.imus.values(), default=0)
+        self._imu = min((number for number, count in found.imus.items() if 2 * count >= most), default=0)
+        unix = found.gps_times[min(found.gps_times)].unix_zero() if found.gps_times else GpsTimeFit().unix_zero()
+        return LogSurvey(unix, found.first_s, found.last_s, {found.system_id: _system(found)})
 
 
-def _take_fix(found: _Found, fix: Values, t_s: float) -> None:
-    if fix["Status"] < _FIX_3D:
-        return
+def _take_fix(found: _Found, receiver: int, fix: Values, t_s: float) -> None:
     if found.first_fix is None:
         found.first_fix = point_of(fix)
-    if "GWk" in fix and "GMS" in fix:
-        found.gps_time.add(t_s, unix_of_week(fix["GWk"], fix["GMS"]))
+    gps_time = found.gps_times.setdefault(receiver, GpsTimeFit())
+    if fix.get("GWk") and "GMS" in fix:
+        gps_time.add(t_s, unix_of_week(fix["GWk"], fix["GMS"]))
 
 
 def _take_origin(found: _Found, values: Values) -> None:
@@ -153,4 +170,5 @@ def _system(found: _Found) -> SystemSurvey:
         first_fix=found.first_fix,
         estimate_frame=estimate_frame,
         truth_from=next((name for name in ("SIM2", "SIM") if found.messages[name]), None),
+        receivers=tuple(sorted(found.gps_times)) or (0,),
     )

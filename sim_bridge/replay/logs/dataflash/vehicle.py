@@ -12,28 +12,37 @@ from collections import Counter
 from collections.abc import Callable
 
 from agent.config.tables import SensorsTable
+from agent.mavlink.boot_times import WRAP_MS_S
 from agent.sensing.frames import FleetFrame, from_euler, normalised
+from agent.sensing.receivers import ReceiverChoice
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Triple
 from sim_bridge.replay.logs.dataflash.records import Values
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
 
+_IMU = ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ")
+_GPS = ("TimeUS", "I", "Status", "GMS", "GWk", "HDop", "Lat", "Lng", "Alt", "Spd", "GCrs", "VZ")
+_GPA = ("TimeUS", "I", "VDop", "HAcc", "VAcc", "SAcc", "SMS")
 WANTED: dict[str, tuple[str, ...]] = {
     "PARM": ("TimeUS", "Name", "Value"),
     "ORGN": ("TimeUS", "Type", "Lat", "Lng", "Alt"),
-    "IMU": ("TimeUS", "I", "GyrX", "GyrY", "GyrZ", "AccX", "AccY", "AccZ"),
+    **dict.fromkeys(("IMU", "IMU2", "IMU3"), _IMU),
     "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
-    "GPS": ("TimeUS", "I", "Status", "GMS", "GWk", "HDop", "Lat", "Lng", "Alt", "Spd", "GCrs", "VZ"),
-    "GPA": ("TimeUS", "I", "VDop", "HAcc", "VAcc", "SAcc", "SMS"),
+    **dict.fromkeys(("GPS", "GPS2"), _GPS),
+    **dict.fromkeys(("GPA", "GPA2"), _GPA),
     "XKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
     "NKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
     "XKF4": ("TimeUS", "PI"),
     "SIM": ("TimeUS", "Lat", "Lng", "Alt", "Q1", "Q2", "Q3", "Q4"),
     "SIM2": ("TimeUS", "PN", "PE", "PD", "VN", "VE", "VD"),
 }
+_NUMBERED = {"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "GPS2": ("GPS", 1), "GPA2": ("GPA", 1)}
+"""Before the field ``I`` came, each further sensor had a record of its own."""
 SAME_INSTANT_S = 0.005
 """Records of one loop of the autopilot are stamped this close."""
 MAX_GPS_AGE_S = 5.0
+ROUNDING_S = 0.002
+"""SMS is in whole milliseconds, and may be of the very instant of the record."""
 BESIDE_S = 0.03
 """Over so short a time a simulator's last position and velocity say where it is now."""
 MOST_HOMES = 1024
@@ -48,33 +57,32 @@ def point_of(values: Values) -> GeodeticPoint | None:
     return GeodeticPoint(lat_deg, lon_deg, alt_m) if inside and (lat_deg or lon_deg) else None
 
 
+def instance_of(name: str, values: Values) -> tuple[str, int]:
+    """The kind of a record, and which of several sensors it is of, from 0."""
+    kind, number = _NUMBERED.get(name, (name, 0))
+    return kind, values.get("I", number)
+
+
 class GpsPairs:
-    """Joins GPS (position) and GPA (accuracy) of the first receiver, which are logged one after the other."""
+    """Joins GPS (position) and GPA (accuracy) of each receiver, which are logged one after the other."""
 
     def __init__(self) -> None:
-        self._fix: Values | None = None
-        self._fix_s = 0.0
+        self._held: dict[int, tuple[float, Values]] = {}
+        """The last fix of each receiver, and its log time."""
 
-    def add(self, name: str, values: Values, t_s: float) -> list[Values]:
-        """The fixes that are complete with this record: GPS fields, and those of GPA where it was logged."""
-        if name not in ("GPS", "GPA"):
-            held = self._fix is not None and t_s - self._fix_s > SAME_INSTANT_S
-            return self._release() if held else []
-        if values.get("I", 0) != 0:
-            return []
-        if name == "GPA":
-            if self._fix is not None and abs(t_s - self._fix_s) <= SAME_INSTANT_S:
-                self._fix = values | self._fix
-            return self._release()
-        complete = self._release()
-        if "Status" in values:
-            self._fix, self._fix_s = values, t_s
-        return complete
-
-    def _release(self) -> list[Values]:
-        complete = [] if self._fix is None else [self._fix]
-        self._fix = None
-        return complete
+    def add(self, name: str, values: Values, t_s: float) -> list[tuple[int, Values]]:
+        """The fixes that are complete with this record, by receiver: GPS fields, those of GPA where it was logged."""
+        kind, receiver = instance_of(name, values)
+        complete = [each for each, (at_s, _) in self._held.items() if t_s - at_s > SAME_INSTANT_S]
+        if kind == "GPA" and receiver in self._held and receiver not in complete:
+            at_s, fix = self._held[receiver]
+            self._held[receiver] = at_s, values | fix
+        if kind in ("GPS", "GPA") and receiver in self._held and receiver not in complete:
+            complete.append(receiver)
+        released = [(each, self._held.pop(each)[1]) for each in complete]
+        if kind == "GPS" and "Status" in values:
+            self._held[receiver] = t_s, values
+        return released
 
 
 class SimHome:
@@ -125,7 +133,7 @@ def moved_on(position: Triple, velocity: Triple, duration_s: float) -> Triple:
 class DataflashVehicle:
     """Records in the order of the log to samples; ``skipped`` counts what gave none, by reason.
 
-    ``sim_home`` is what the simulator's motion (SIM2) is about, `SimHome`.
+    ``sim_home`` is what the simulator's motion (SIM2) is about, `SimHome`; ``imu`` which IMU is listened to.
     """
 
     def __init__(
@@ -135,7 +143,10 @@ class DataflashVehicle:
         system: SystemSurvey,
         sim_home: GeodeticPoint | None,
         skipped: Counter[str],
+        imu: int = 0,
     ) -> None:
+        self._imu_number = imu
+        self._choice = ReceiverChoice(system.receivers)
         self._frame = frame
         self._sensors = sensors
         self._skipped = skipped
@@ -157,10 +168,18 @@ class DataflashVehicle:
     def samples(self, name: str, values: Values, t_s: float) -> list[LogSample]:
         """The samples of a record of log time ``t_s``."""
         made: list[LogSample] = []
-        for fix in self._pairs.add(name, values, t_s):
+        for receiver, fix in self._pairs.add(name, values, t_s):
             gps = self._gps(fix, t_s)
-            if gps is not None:
+            if gps is None:
+                self._choice.without_fix(receiver)
+            elif self._choice.takes(receiver, t_s):
                 made.append(gps)
+            else:
+                self._skip("gps: not the first one")
+        name, number = instance_of(name, values)
+        if name == "IMU" and number != self._imu_number:
+            self._skip("imu: not the first one")
+            return made
         converter = self._converters.get(name)
         if converter is not None:
             try:
@@ -175,8 +194,6 @@ class DataflashVehicle:
     # --- sensors ---------------------------------------------------------------------------------------------
 
     def _imu(self, values: Values, t_s: float) -> LogSample | None:
-        if values.get("I", 0) != 0:
-            return self._skip("imu: not the first one")
         force = (values["AccX"], values["AccY"], values["AccZ"])
         turn = (values["GyrX"], values["GyrY"], values["GyrZ"])
         sample = imu_sample(t_s, force, turn, "ardupilot", self._sensors)
@@ -194,8 +211,9 @@ class DataflashVehicle:
             return self._skip("gps: no position")
         t_s = now_s
         if values.get("SMS"):  # the same clock as TimeUS, in ms
-            t_s += values["SMS"] * 1e-3 - values["TimeUS"] * 1e-6
-            if not 0.0 <= now_s - t_s <= MAX_GPS_AGE_S:
+            age_s = (values["TimeUS"] * 1e-6 - values["SMS"] * 1e-3 + ROUNDING_S) % WRAP_MS_S - ROUNDING_S
+            t_s -= age_s
+            if age_s > MAX_GPS_AGE_S:
                 return self._skip("gps: wrong time")
         fix = ReceiverFix(
             t_s=t_s,

@@ -134,11 +134,11 @@ class FrameReader:
         return limit
 
 
-def is_frame(data: bytes, start: int) -> bool:
-    """Whether a frame of the dialect with a correct checksum begins here."""
+def is_frame(data: bytes, start: int) -> int:
+    """Bytes of the frame of the dialect with a correct checksum that begins here; 0 if none does."""
     length = _frame_length(data, start)
     if not length:
-        return False
+        return 0
     if data[start] == V2:
         message_id = data[start + 7] | data[start + 8] << 8 | data[start + 9] << 16
         end = start + length - (SIGNATURE_BYTES if data[start + 2] & SIGNED else 0)
@@ -146,9 +146,9 @@ def is_frame(data: bytes, start: int) -> bool:
         message_id, end = data[start + 5], start + length
     extra = _EXTRA.get(message_id)
     if extra is None:
-        return False
+        return 0
     crc: int = mavlink.x25crc(data[start + 1 : end - 2] + extra).crc
-    return crc == data[end - 2] | data[end - 1] << 8
+    return length if crc == data[end - 2] | data[end - 1] << 8 else 0
 
 
 def _frame_length(data: bytes, start: int) -> int:
@@ -181,7 +181,9 @@ def decoded(message_id: int, payload: bytes) -> Message:
     if len(values) == len(kind.orders):
         return kind(*[values[order] for order in kind.orders])
     ends = list(accumulate(kind.lengths, initial=0))
-    return kind(*[
-        list(values[ends[order] : ends[order + 1]]) if kind.lengths[order] > 1 else values[ends[order]]
-        for order in kind.orders
-    ])
+    return kind(
+        *[
+            list(values[ends[order] : ends[order + 1]]) if kind.lengths[order] > 1 else values[ends[order]]
+            for order in kind.orders
+        ]
+    )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections import Counter, defaultdict
-from collections.abc import Generator, Iterator
+from collections.abc import Collection, Generator, Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
 from itertools import chain
@@ -13,9 +13,11 @@ from pathlib import Path
 from typing import Literal
 
 from agent.config.tables import SensorsTable
+from agent.mavlink.boot_times import SHOW_MS, WRAP_MS_S, WRAP_US_S, turns
 from agent.mavlink.codec import Message, mavlink
+from agent.mavlink.components import AUTOPILOT_COMPONENT, FLAVOURS, SENSORS, Standing, speaks_for_vehicle, standing
 from agent.mavlink.sample_adapter import UNIX_US
-from agent.mavlink.session import FLAVOURS
+from agent.mavlink.utc_stamps import clocks_agree, quickest_s, unrolled
 from agent.sensing.frames import FleetFrame
 from sim_bridge.replay.logs.boot_clock import BootClockFit, LogBootClock
 from sim_bridge.replay.logs.events import (
@@ -30,24 +32,22 @@ from sim_bridge.replay.logs.events import (
     UnixZero,
 )
 from sim_bridge.replay.logs.files import opened
+from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, GpsTimeFit
 from sim_bridge.replay.logs.stamps import StampRepair, without_outliers
 from sim_bridge.replay.logs.surveyed import SurveyedLog
 from sim_bridge.replay.logs.telemetry.frames import Frame, FrameReader, decoded
+from sim_bridge.replay.logs.telemetry.pace import Pace, PaceSurvey
 from sim_bridge.replay.logs.telemetry.vehicle import ESTIMATES, TRUTHS, LoggedVehicle
 
 _NAMED = {
     message_id: mavlink.mavlink_map[message_id].msgname
     for message_id in (
+        *SENSORS,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-        mavlink.MAVLINK_MSG_ID_RAW_IMU,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
         mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT,
         mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN,
-        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
         mavlink.MAVLINK_MSG_ID_SIM_STATE,
         mavlink.MAVLINK_MSG_ID_HIL_STATE_QUATERNION,
         mavlink.MAVLINK_MSG_ID_SIMSTATE,
@@ -55,16 +55,10 @@ _NAMED = {
     )
 }
 _WANTED = frozenset(_NAMED)
+_KIND_OF_SENSOR = {_NAMED[message_id]: kind for message_id, kind in SENSORS.items()}
 _MS, _US = struct.Struct("<I"), struct.Struct("<Q")
-_BOOT_MS_AT = {
-    mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 8,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE: 0,
-    mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 0,
-    mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 0,
-    mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: 0,
-}
-"""Where ``time_boot_ms`` is in the payload: the stamps that show the boot clock."""
-_BOOT_US = {mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_RAW_IMU}
+_HIGHRES_IMU, _RAW_IMU = mavlink.MAVLINK_MSG_ID_HIGHRES_IMU, mavlink.MAVLINK_MSG_ID_RAW_IMU
+_BOOT_US = {_HIGHRES_IMU, _RAW_IMU}
 """Messages that begin with ``time_usec``. (GPS_RAW_INT does too, but bears the time of the fix, long ago.)"""
 OLDEST_UNIX_S = 1e9
 """A stamp before 2001 is of a clock that was never set."""
@@ -89,17 +83,43 @@ class _SourceSurvey:
     last_s: float = 0.0
     messages: Counter[str] = field(default_factory=Counter)
     clock: BootClockFit = field(default_factory=BootClockFit)
+    raw_clock: BootClockFit = field(default_factory=lambda: BootClockFit(WRAP_US_S))
+    """By RAW_IMU alone."""
+    shown: tuple[float, float] | None = None
+    """The last boot time of another message than RAW_IMU, and its arrival."""
+    pace: PaceSurvey = field(default_factory=PaceSurvey)
+    utc: GpsTimeFit = field(default_factory=GpsTimeFit)
+    """Arrival and UTC of fixes."""
+    receivers: set[int] = field(default_factory=set)
     flavours: Counter[Flavour] = field(default_factory=Counter)
     origin: GeodeticPoint | None = None
     home: GeodeticPoint | None = None
     first_fix: GeodeticPoint | None = None
 
+    @property
+    def kinds(self) -> set[str]:
+        """The sensors that it sends."""
+        return {_KIND_OF_SENSOR[name] for name in self.messages if name in _KIND_OF_SENSOR}
+
+    def on_boot_time(self, message_id: int, boot_s: float, arrival_s: float) -> None:
+        """Take in the boot time that a message shows; RAW_IMU's may have wrapped, which the others tell."""
+        if message_id == _RAW_IMU:
+            self.raw_clock.add(boot_s, arrival_s)
+            if self.shown is None:
+                return
+            expected_s = self.shown[0] + arrival_s - self.shown[1]
+            boot_s += turns(boot_s, expected_s, WRAP_US_S) * WRAP_US_S
+        else:
+            self.shown = boot_s, arrival_s
+            self.pace.add(boot_s, arrival_s)
+        self.clock.add(boot_s, arrival_s)
+
 
 class TlogSource(SurveyedLog):
     """A `LogSource` over a ``.tlog``, plain or gzip.
 
-    A vehicle is every system with a heartbeat of an autopilot; where no heartbeat was recorded at all, every
-    system whose component 1 sent something that only an autopilot knows.
+    A vehicle is every system with a heartbeat of an autopilot; where none of any autopilot was recorded, every system
+    whose component 1 sent sensors. Which component that is, `agent.mavlink.components` tells.
     """
 
     format: Format = "tlog"
@@ -108,6 +128,9 @@ class TlogSource(SurveyedLog):
         super().__init__(path, frame, sensors)
         self._sources: dict[int, Source] = {}
         self._clocks: dict[int, LogBootClock] = {}
+        self._pace: Pace | None = None
+        self._recorder_zero_s = 0.0
+        """Unix time of log time 0 by the recorder's clock."""
         self._clock_notes: Counter[str] = Counter()
 
     def events(self) -> Iterator[LogEvent]:
@@ -117,7 +140,7 @@ class TlogSource(SurveyedLog):
         frame = self.frame
         vehicles = {
             self._sources[system_id]: LoggedVehicle(
-                frame, self._sensors, survey.unix.unix_s, self._clocks[system_id], found
+                frame, self._sensors, self._recorder_zero_s, self._clocks[system_id], found
             )
             for system_id, found in survey.systems.items()
         }
@@ -129,7 +152,8 @@ class TlogSource(SurveyedLog):
                         counts.skipped["from no autopilot"] += 1
                         continue
                     if boot_s is not None:
-                        vehicle.on_boot_time(boot_s, arrival_s)
+                        wrap_s = WRAP_US_S if message_id == _RAW_IMU else WRAP_MS_S
+                        vehicle.on_boot_time(boot_s, arrival_s, wrap_s)
                     if message_id not in vehicle.wanted:
                         continue
                     sample = vehicle.sample(message_id, decoded(message_id, payload), arrival_s)
@@ -140,6 +164,7 @@ class TlogSource(SurveyedLog):
         finally:
             for vehicle in vehicles.values():
                 counts.skipped.update(vehicle.skipped)
+                counts.notes.update(vehicle.noted)
             counts.notes.update(self._clock_notes)
 
     def _placed(self, counts: LogCounts, repair: StampRepair) -> Generator[Placed, None, None]:
@@ -151,38 +176,73 @@ class TlogSource(SurveyedLog):
             for stamp_us, system_id, component_id, message_id, payload in frames:
                 wanted += 1
                 boot_s = _boot_s(message_id, payload)
-                arrival_s = repair.place(stamp_us, system_id, boot_s)
+                of_clock = None if message_id == _RAW_IMU else boot_s  # that one may have wrapped
+                arrival_s = repair.place(stamp_us, system_id << 8 | component_id, of_clock)
                 if arrival_s is None:
                     counts.skipped["wrong stamp of the recorder"] += 1
                 else:
+                    arrival_s = arrival_s if self._pace is None else self._pace.log_s(arrival_s)
                     yield arrival_s, (system_id, component_id), message_id, payload, boot_s
             counts.notes["messages of no interest"] += reader.frames - wanted
 
     def _made_survey(self) -> LogSurvey:
+        heard, repair, counts = self._heard()
+        self._sources = _autopilots(heard)
+        if not self._sources:
+            raise LogError(self.path, "frames of an autopilot", _what_else(heard, counts))
+        busiest = max(self._sources.values(), key=lambda source: heard[source].messages.total())
+        self._pace = heard[busiest].pace.pace()
+        if self._pace is not None:
+            heard, repair, counts = self._heard()  # anew, on the vehicles' time
+        found = {system_id: heard[source] for system_id, source in self._sources.items()}
+        self._clocks = {system_id: LogBootClock(_clock(each).sessions()) for system_id, each in found.items()}
+        self._clock_notes = sum((_clock_notes(_clock(each)) for each in found.values()), Counter())
+        if self._pace is not None:
+            self._clock_notes[f"simulator at {self._pace.mean:.2f} of real time: its clock is the log's"] = 1
+        systems = {system_id: _system(system_id, each) for system_id, each in found.items()}
+        first_s = min((each.first_s for each in heard.values()), default=0.0)
+        last_s = max((each.last_s for each in heard.values()), default=0.0)
+        return LogSurvey(self._unix(repair, found.values()), first_s, last_s, systems)
+
+    def _heard(self) -> tuple[dict[Source, _SourceSurvey], StampRepair, LogCounts]:
+        """One pass over the log."""
         counts = LogCounts()
         repair = StampRepair(counts.notes)
         heard: dict[Source, _SourceSurvey] = {}
-        first_s, last_s = 0.0, 0.0
         for arrival_s, source, message_id, payload, boot_s in self._placed(counts, repair):
             found = heard.get(source)
             if found is None:
                 found = heard[source] = _SourceSurvey(arrival_s)
-            found.last_s = last_s = arrival_s
+            found.last_s = arrival_s
             found.messages[_NAMED[message_id]] += 1
             if boot_s is not None:
-                found.clock.add(boot_s, arrival_s)
+                found.on_boot_time(message_id, boot_s, arrival_s)
             take = _TAKE.get(message_id)
             if take is not None:
                 take(found, decoded(message_id, payload))
-        self._sources = _autopilots(heard)
-        if not self._sources:
-            raise LogError(self.path, "frames of an autopilot", _what_else(heard, counts))
-        self._clocks = {
-            system_id: LogBootClock(heard[source].clock.sessions()) for system_id, source in self._sources.items()
-        }
-        self._clock_notes = sum((_clock_notes(heard[source].clock) for source in self._sources.values()), Counter())
-        systems = {system_id: _system(system_id, heard[source]) for system_id, source in self._sources.items()}
-        return LogSurvey(_unix(repair), first_s, last_s, systems)
+        return heard, repair, counts
+
+    def _unix(self, repair: StampRepair, vehicles: Collection[_SourceSurvey]) -> UnixZero:
+        """By the recorder's clock, unless the UTC of fixes contradicts it."""
+        drift = 0.0 if self._pace is None else 1.0 / self._pace.mean - 1.0
+        zero_s = repair.zero_stamp_s
+        self._recorder_zero_s = 0.0 if zero_s is None or zero_s < OLDEST_UNIX_S else zero_s
+        pairs = [pair for found in vehicles for pair in found.utc.pairs]
+        if self._recorder_zero_s:
+            late_s = [
+                self._recorder_zero_s + arrival_s - unrolled(unix_s, self._recorder_zero_s)
+                for arrival_s, unix_s in pairs
+            ]
+            if not late_s or clocks_agree(quickest_s(late_s)):
+                return UnixZero(self._recorder_zero_s, HOST_CLOCK_SIGMA_S, "host", drift)
+        elif pairs:
+            late_s = [arrival_s - unix_s for arrival_s, unix_s in pairs]
+        else:
+            return UnixZero(0.0, float("inf"), "unknown", drift)
+        latency_s = RECEIVER_LATENCY_SIGMA_S  # of the quickest, about
+        return UnixZero(
+            self._recorder_zero_s - quickest_s(late_s) + latency_s, RECEIVER_LATENCY_SIGMA_S, "gps", drift
+        )
 
 
 def _restamped(frame: Frame, stamp_us: int) -> Frame:
@@ -191,7 +251,7 @@ def _restamped(frame: Frame, stamp_us: int) -> Frame:
 
 def _boot_s(message_id: int, payload: bytes) -> float | None:
     """Boot time that a message shows; ``None`` if it shows none."""
-    at = _BOOT_MS_AT.get(message_id)
+    at = SHOW_MS.get(message_id)
     if at is not None:
         return float(_MS.unpack(payload[at : at + 4].ljust(4, b"\0"))[0] * 1e-3)
     if message_id in _BOOT_US:
@@ -204,14 +264,27 @@ def _boot_s(message_id: int, payload: bytes) -> float | None:
 
 
 def _heartbeat(found: _SourceSurvey, message: Message) -> None:
-    if message.autopilot != mavlink.MAV_AUTOPILOT_INVALID and message.type != mavlink.MAV_TYPE_GCS:
+    if speaks_for_vehicle(message):
         flavour: Flavour = FLAVOURS.get(message.autopilot, "other")  # type: ignore[assignment]
         found.flavours[flavour] += 1
 
 
 def _gps_raw_int(found: _SourceSurvey, message: Message) -> None:
-    if found.first_fix is None and message.fix_type >= mavlink.GPS_FIX_TYPE_3D_FIX:
+    _fix(found, message, 0)
+
+
+def _gps2_raw(found: _SourceSurvey, message: Message) -> None:
+    _fix(found, message, 1)
+
+
+def _fix(found: _SourceSurvey, message: Message, receiver: int) -> None:
+    if message.fix_type < mavlink.GPS_FIX_TYPE_3D_FIX:
+        return
+    found.receivers.add(receiver)
+    if found.first_fix is None:
         found.first_fix = _point(message.lat, message.lon, message.alt)
+    if message.time_usec > UNIX_US:
+        found.utc.add(found.last_s, message.time_usec * 1e-6)
 
 
 def _origin(found: _SourceSurvey, message: Message) -> None:
@@ -233,6 +306,7 @@ def _point(lat_e7: int, lon_e7: int, alt_mm: int) -> GeodeticPoint | None:
 _TAKE = {
     mavlink.MAVLINK_MSG_ID_HEARTBEAT: _heartbeat,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: _gps_raw_int,
+    mavlink.MAVLINK_MSG_ID_GPS2_RAW: _gps2_raw,
     mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: _origin,
     mavlink.MAVLINK_MSG_ID_HOME_POSITION: _home,
 }
@@ -242,16 +316,36 @@ _TAKE = {
 
 
 def _autopilots(heard: dict[Source, _SourceSurvey]) -> dict[int, Source]:
-    """The autopilot's source of each system: the one with most heartbeats."""
+    """The autopilot's source of each system; systems without any sensor are none where others have some."""
+    candidates = {
+        source: found
+        for source, found in sorted(heard.items())
+        if found.flavours and (found.messages.total() >= FEWEST_MESSAGES or len(heard) == 1)
+    }
+    if not candidates:
+        candidates = {
+            source: found
+            for source, found in sorted(heard.items())
+            if source[1] == AUTOPILOT_COMPONENT and found.kinds
+        }
+    if any(found.kinds for found in candidates.values()):
+        candidates = {source: found for source, found in candidates.items() if found.kinds}
     chosen: dict[int, Source] = {}
-    for source, found in sorted(heard.items()):
-        if found.flavours and (found.messages.total() >= FEWEST_MESSAGES or len(heard) == 1):
-            other = chosen.get(source[0])
-            if other is None or heard[other].flavours.total() < found.flavours.total():
-                chosen[source[0]] = source
-    if not any(found.messages["HEARTBEAT"] for found in heard.values()):
-        chosen = {source[0]: source for source in sorted(heard) if source[1] == 1}
+    for source in candidates:
+        other = chosen.get(source[0])
+        if other is None or _rank(heard, other) < _rank(heard, source):
+            chosen[source[0]] = source
     return chosen
+
+
+def _rank(heard: dict[Source, _SourceSurvey], source: Source) -> tuple[Standing, int]:
+    found = heard[source]
+    return standing(source[1], found.kinds, found.flavours), found.flavours.total()
+
+
+def _clock(found: _SourceSurvey) -> BootClockFit:
+    """The boot clock by all messages, or by RAW_IMU where no other shows it."""
+    return found.clock if found.clock.heard else found.raw_clock
 
 
 def _system(system_id: int, found: _SourceSurvey) -> SystemSurvey:
@@ -260,13 +354,14 @@ def _system(system_id: int, found: _SourceSurvey) -> SystemSurvey:
         flavour=found.flavours.most_common(1)[0][0] if found.flavours else "unknown",
         first_s=found.first_s,
         last_s=found.last_s,
-        reboots=found.clock.reboots,
+        reboots=_clock(found).reboots,
         messages=dict(found.messages),
         origin=found.origin,
         home=found.home,
         first_fix=found.first_fix,
         estimate_frame=_estimate_frame(found),
         truth_from=next((name for name in TRUTHS if found.messages[name]), None),
+        receivers=tuple(sorted(found.receivers)) or (0,),
     )
 
 
@@ -288,13 +383,6 @@ def _estimate_frame(found: _SourceSurvey) -> Literal["fleet", "own", "none"]:
     if found.messages[everywhere]:
         return "fleet"
     return "own" if found.messages[local] else "none"
-
-
-def _unix(repair: StampRepair) -> UnixZero:
-    zero_s = repair.zero_stamp_s
-    if zero_s is None or zero_s < OLDEST_UNIX_S:
-        return UnixZero(0.0, float("inf"), "unknown")
-    return UnixZero(zero_s, HOST_CLOCK_SIGMA_S, "host")
 
 
 def _what_else(heard: dict[Source, _SourceSurvey], counts: LogCounts) -> str:

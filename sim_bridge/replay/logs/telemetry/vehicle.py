@@ -12,7 +12,9 @@ from collections import Counter
 from collections.abc import Callable
 
 from agent.config.tables import SensorsTable
+from agent.mavlink.boot_times import WRAP_MS_S
 from agent.mavlink.codec import Message, mavlink
+from agent.mavlink.components import SENSORS
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.samples import AutopilotEstimate, Quaternion, RangeSample, Triple
@@ -23,15 +25,6 @@ TRUTHS = ("SIM_STATE", "HIL_STATE_QUATERNION", "SIMSTATE")
 """Messages that hold the simulator's truth, the best one first."""
 ESTIMATES = ("LOCAL_POSITION_NED", "GLOBAL_POSITION_INT")
 """Messages that hold the autopilot's estimate: about its own origin, and geodetic."""
-_SENSORS = frozenset(
-    (
-        mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
-        mavlink.MAVLINK_MSG_ID_RAW_IMU,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
-        mavlink.MAVLINK_MSG_ID_ATTITUDE,
-        mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
-    )
-)
 FRESH_BOOT_S = 0.02
 """Truth bears no time: it is of the instant of the message before it, if that came this shortly before."""
 
@@ -44,13 +37,13 @@ class LoggedVehicle:
     ) -> None:
         self._frame = frame
         self._clock = clock
-        self._adapter = SampleAdapter(frame, sensors, epoch_unix_s, clock.log_s)
+        self._adapter = SampleAdapter(frame, sensors, epoch_unix_s, clock.log_s, found.receivers)
         self._adapter.flavour = found.flavour
         self._session = -1
-        self._boot: tuple[float, float] | None = None
+        self._boot: tuple[float, float, float] | None = None
         self._origin_m = None if found.origin is None else self._ned(found.origin)
         self._skipped: Counter[str] = Counter()
-        sensors_and_own = _SENSORS
+        sensors_and_own = frozenset(SENSORS)
         self._converters: dict[int, Callable[[Message, float], LogSample | None]] = {
             mavlink.MAVLINK_MSG_ID_GPS_GLOBAL_ORIGIN: self._gps_global_origin
         }
@@ -66,14 +59,20 @@ class LoggedVehicle:
             }[found.truth_from]
             self._converters[message_id] = converter
         self.wanted = sensors_and_own | self._converters.keys()
+
     @property
     def skipped(self) -> Counter[str]:
         """Messages that gave no sample, by reason."""
         return self._adapter.skipped + self._skipped
 
-    def on_boot_time(self, boot_s: float, arrival_s: float) -> None:
-        """Note the boot time that a message shows, before its `sample` is asked for."""
-        self._boot = (boot_s, arrival_s)
+    @property
+    def noted(self) -> Counter[str]:
+        """What was dealt with in messages that gave one."""
+        return self._adapter.noted
+
+    def on_boot_time(self, boot_s: float, arrival_s: float, wrap_s: float) -> None:
+        """Note the boot time that a message shows, before its `sample` is asked for; it wraps after ``wrap_s``."""
+        self._boot = (boot_s, arrival_s, wrap_s)
         session = self._clock.session(arrival_s)
         if session != self._session:
             if self._session >= 0:
@@ -104,7 +103,7 @@ class LoggedVehicle:
         if not (message.lat or message.lon):
             return self._skip("global position: none")
         position_m = self._ned(GeodeticPoint(message.lat * 1e-7, message.lon * 1e-7, message.alt * 1e-3))
-        t_s = self._clock.log_s(message.time_boot_ms * 1e-3, arrival_s)
+        t_s = self._clock.unwrapped_s(message.time_boot_ms * 1e-3, arrival_s, WRAP_MS_S)
         if position_m is None or t_s is None:
             return self._skip("global position: no height of the fleet's sort, or clock unknown")
         return AutopilotEstimate(t_s, position_m, (message.vx * 1e-2, message.vy * 1e-2, message.vz * 1e-2))
@@ -154,7 +153,7 @@ class LoggedVehicle:
     def _truth_time(self, arrival_s: float) -> float:
         """Simulators send truth in one burst with stamped messages of the same instant."""
         if self._boot is not None and arrival_s - self._boot[1] <= FRESH_BOOT_S:
-            t_s = self._clock.log_s(self._boot[0], arrival_s)
+            t_s = self._clock.unwrapped_s(self._boot[0], arrival_s, self._boot[2])
             if t_s is not None:
                 return t_s
         return arrival_s

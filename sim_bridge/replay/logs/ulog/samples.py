@@ -5,15 +5,18 @@ Samples bear ``timestamp_sample``, the instant of the value, where the firmware 
 
 from __future__ import annotations
 
+import heapq
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from operator import itemgetter
 
 import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.tables import SensorsTable
 from agent.sensing.frames import FleetFrame, normalised
+from agent.sensing.receivers import ReceiverChoice
 from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Quaternion, Triple
 from sim_bridge.replay.logs.events import LogSample, TruthSample
 from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
@@ -24,16 +27,21 @@ _IMU = (
     "accelerometer_m_s2[0]", "accelerometer_m_s2[1]", "accelerometer_m_s2[2]", "gyro_rad[0]", "gyro_rad[1]",
     "gyro_rad[2]",
 )  # fmt: skip
+_BIAS = ("accel_bias[0]", "accel_bias[1]", "accel_bias[2]", "gyro_bias[0]", "gyro_bias[1]", "gyro_bias[2]")
+LARGEST_BIAS_MPS2 = 1.0
+"""What PX4's filter says beyond this is no bias (its own limit is 0.4)."""
+FIX_3D = 3
 _MOTION = ("x", "y", "z", "vx", "vy", "vz")
 _REFERENCE = ("ref_lat", "ref_lon", "ref_alt")
 _GPS = (
     "timestamp_sample", "time_utc_usec", "fix_type", "eph", "epv", "hdop", "vdop", "s_variance_m_s", "vel_m_s",
-    "vel_d_m_s", "cog_rad", "vel_ned_valid", "latitude_deg", "longitude_deg", "altitude_msl_m",
-    "altitude_ellipsoid_m", "lat", "lon", "alt", "alt_ellipsoid",
+    "vel_n_m_s", "vel_e_m_s", "vel_d_m_s", "cog_rad", "vel_ned_valid", "latitude_deg", "longitude_deg",
+    "altitude_msl_m", "altitude_ellipsoid_m", "lat", "lon", "alt", "alt_ellipsoid",
 )  # fmt: skip
 GPS_TOPICS = ("vehicle_gps_position", "sensor_gps")
 WANTED: dict[str, tuple[str, ...]] = {
     "sensor_combined": _IMU,
+    "estimator_sensor_bias": (*_BIAS, "accel_bias_valid", "gyro_bias_valid"),
     "vehicle_attitude": ("timestamp_sample", *_QUATERNION),
     "vehicle_local_position": ("timestamp_sample", *_MOTION, *_REFERENCE, "xy_global", "xy_valid", "z_valid"),
     "vehicle_local_position_groundtruth": ("timestamp_sample", *_MOTION, *_REFERENCE),
@@ -75,18 +83,38 @@ def _rows(table: TopicTable, values: NDArray[np.float64]) -> Iterator[tuple[floa
         )
 
 
-def imu_samples(table: TopicTable, sensors: SensorsTable, skipped: Counter[str]) -> Iterator[Timed]:
-    """``sensor_combined``: gyro at the record's stamp; the accelerometer's few microseconds beside it are left."""
+def imu_samples(
+    table: TopicTable, biases: TopicTable | None, sensors: SensorsTable, skipped: Counter[str]
+) -> Iterator[Timed]:
+    """``sensor_combined``: gyro at the record's stamp; the accelerometer's few microseconds beside it are left.
+
+    What the autopilot's filter knows of the biases (``estimator_sensor_bias``) is taken off, as in PX4's HIGHRES_IMU.
+    """
     values = table.stack(*_IMU)
     if values is None:
         skipped["sensor_combined: fields missing"] += len(table)
         return
+    if biases is not None:
+        values = values - _biases_at(table, biases)
     for arrival_s, t_s, row in _rows(table, values):
         sample = imu_sample(t_s, (row[0], row[1], row[2]), (row[3], row[4], row[5]), "px4", sensors)
         if isinstance(sample, ImuSample):
             yield arrival_s, sample
         else:
             skipped[sample] += 1
+
+
+def _biases_at(table: TopicTable, biases: TopicTable) -> NDArray[np.float64]:
+    """The biases known at each record ``(m, 6)``, in the order of `_IMU`; zero before, and where not valid."""
+    known = np.zeros((len(biases) + 1, len(_IMU)))
+    for columns, sensor, largest in ((slice(0, 3), "accel", LARGEST_BIAS_MPS2), (slice(3, 6), "gyro", math.inf)):
+        told = biases.stack(*(f"{sensor}_bias[{axis}]" for axis in range(3)))
+        if told is None:
+            continue
+        flags = biases.columns.get(f"{sensor}_bias_valid", np.ones(len(biases)))
+        usable = np.isfinite(told).all(axis=1) & (np.abs(told) <= largest).all(axis=1) & (flags != 0)
+        known[1:, columns] = np.where(usable[:, None], told, 0.0)
+    return known[np.searchsorted(biases.timestamp_us, table.timestamp_us, side="right")]
 
 
 def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed]:
@@ -103,15 +131,44 @@ def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed
             yield arrival_s, AttitudeSample(t_s, quaternion)
 
 
-def gps_samples(
-    table: TopicTable, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]
+def fixes_of(table: TopicTable) -> int:
+    """How many fixes a receiver has."""
+    return int((table.columns["fix_type"] >= FIX_3D).sum()) if "fix_type" in table.columns else 0
+
+
+def has_fixes(table: TopicTable) -> bool:
+    """Whether a receiver has any."""
+    return fixes_of(table) > 0
+
+
+def chosen_fixes(
+    receivers: Mapping[int, TopicTable], frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]
 ) -> Iterator[Timed]:
+    """The fixes of the receivers by their numbers, in the order of arrival, each of the one to be listened to."""
+    choice = ReceiverChoice([number for number, table in receivers.items() if has_fixes(table)])
+    streams = [_fixes(number, table, frame, sensors, skipped) for number, table in receivers.items()]
+    for arrival_s, number, sample in heapq.merge(*streams, key=itemgetter(0, 1)):
+        if isinstance(sample, str):
+            skipped[sample] += 1
+            choice.without_fix(number)
+        elif choice.takes(number, arrival_s):
+            yield arrival_s, sample
+        else:
+            skipped["gps: not the first one"] += 1
+
+
+def _fixes(
+    receiver: int, table: TopicTable, frame: FleetFrame, sensors: SensorsTable, skipped: Counter[str]
+) -> Iterator[tuple[float, int, GpsSample | str]]:
     """``vehicle_gps_position`` or ``sensor_gps``; ``eph``, ``epv`` are 1-sigma in m."""
     where = degrees(table)
     if where is None or "fix_type" not in table.columns:
         skipped[f"{table.name}: fields missing"] += len(table)
         return
-    others = ("fix_type", "eph", "epv", "hdop", "vdop", "s_variance_m_s", "vel_m_s", "vel_d_m_s", "cog_rad")
+    others = (
+        "fix_type", "eph", "epv", "hdop", "vdop", "s_variance_m_s", "vel_m_s", "vel_d_m_s", "cog_rad", "vel_n_m_s",
+        "vel_e_m_s", "vel_ned_valid",
+    )  # fmt: skip
     columns = [table.columns.get(name, np.full(len(table), np.nan)) for name in others]
     values = np.column_stack((where, *(np.asarray(column, np.float64) for column in columns)))
     for arrival_s, t_s, row in _rows(table, values):
@@ -130,12 +187,10 @@ def gps_samples(
             speed_mps=row[10],
             down_mps=row[11],
             course_rad=row[12],
+            # vel_m_s is the norm with some receivers (DroneCAN, VectorNav), the ground speed with others
+            ground_velocity_mps=(row[13], row[14]) if row[15] == 1.0 else None,
         )
-        sample = gps_sample(fix, frame, "px4", sensors)
-        if isinstance(sample, GpsSample):
-            yield arrival_s, sample
-        else:
-            skipped[sample] += 1
+        yield arrival_s, receiver, gps_sample(fix, frame, "px4", sensors)
 
 
 def degrees(table: TopicTable) -> NDArray[np.float64] | None:

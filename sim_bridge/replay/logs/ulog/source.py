@@ -5,7 +5,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Literal
 
@@ -23,16 +23,19 @@ from sim_bridge.replay.logs.events import (
     SystemSurvey,
     UnixZero,
 )
-from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted
+from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted, since_earliest
 from sim_bridge.replay.logs.surveyed import SurveyedLog
 from sim_bridge.replay.logs.ulog.samples import (
+    FIX_3D,
     GPS_TOPICS,
     WANTED,
     Timed,
     attitude_samples,
+    chosen_fixes,
     degrees,
     estimate_samples,
-    gps_samples,
+    fixes_of,
+    has_fixes,
     imu_samples,
     truth_samples,
 )
@@ -42,7 +45,6 @@ __all__ = ["MAGIC", "UlogSource"]
 
 UNIX_US = 10**15
 TIMESYNC_SIGMA_S = 0.01
-_FIX_3D = 3
 
 
 class UlogSource(SurveyedLog):
@@ -64,7 +66,8 @@ class UlogSource(SurveyedLog):
         streams: list[Iterator[Timed]] = []
         for name, table in tables.topics.items():
             if name == "sensor_combined":
-                streams.append(imu_samples(table, self._sensors, skipped))
+                biases = tables.topics.get("estimator_sensor_bias")
+                streams.append(imu_samples(table, biases, self._sensors, skipped))
             elif name == "vehicle_attitude":
                 streams.append(attitude_samples(table, skipped))
             elif name == "vehicle_local_position":
@@ -72,9 +75,7 @@ class UlogSource(SurveyedLog):
             elif name == "vehicle_local_position_groundtruth":
                 attitude = tables.topics.get("vehicle_attitude_groundtruth")
                 streams.append(truth_samples(table, attitude, frame, skipped))
-        gps = _gps_table(tables)
-        if gps is not None:
-            streams.append(gps_samples(gps, frame, self._sensors, skipped))
+        streams.append(chosen_fixes(_receivers(tables), frame, self._sensors, skipped))
         for arrival_s, sample in heapq.merge(*streams, key=_arrival):
             event = LogEvent(arrival_s, system.system_id, sample)
             counts.count(event)
@@ -83,15 +84,17 @@ class UlogSource(SurveyedLog):
     def _tables(self) -> Tables:
         if self._loaded is None:
             self._damage.clear()
-            self._loaded = load_tables(self.path, WANTED, self._damage)
+            self._loaded = load_tables(self.path, WANTED, self._damage, several=GPS_TOPICS)
         return self._loaded
 
     def _made_survey(self) -> LogSurvey:
         tables = self._tables()
-        if not tables.topics:
+        receivers = _receivers(tables)
+        everything = [*tables.topics.values(), *receivers.values()]
+        if not everything:
             raise LogError(self.path, "topics of sensors or estimates", "none that could be read")
-        first_s = min(int(table.timestamp_us[0]) for table in tables.topics.values()) * 1e-6
-        last_s = max(int(table.timestamp_us[-1]) for table in tables.topics.values()) * 1e-6
+        first_s = min(int(table.timestamp_us[0]) for table in everything) * 1e-6
+        last_s = max(int(table.timestamp_us[-1]) for table in everything) * 1e-6
         system_id = tables.parameters.get("MAV_SYS_ID", 1.0)
         system_id = system_id if 1.0 <= system_id <= 255.0 else 1.0  # false for NaN as well
         local = tables.topics.get("vehicle_local_position")
@@ -103,12 +106,13 @@ class UlogSource(SurveyedLog):
             first_s=first_s,
             last_s=last_s,
             reboots=0,
-            messages={name: len(table) for name, table in tables.topics.items()},
+            messages={table.name: len(table) for table in reversed(everything)},
             origin=origin,
             home=None,
-            first_fix=_first_fix(_gps_table(tables)),
+            first_fix=next((point for point in map(_first_fix, receivers.values()) if point is not None), None),
             estimate_frame="fleet" if origin is not None else estimate_frame,
             truth_from=next((name for name in tables.topics if name == "vehicle_local_position_groundtruth"), None),
+            receivers=tuple(number for number, table in receivers.items() if has_fixes(table)) or (0,),
         )
         return LogSurvey(_unix(tables), first_s, last_s, {system.system_id: system})
 
@@ -117,10 +121,15 @@ def _arrival(timed: Timed) -> float:
     return timed[0]
 
 
-def _gps_table(tables: Tables) -> TopicTable | None:
-    """The topic with most fixes: firmware logs the receiver's and the blended one, each at its own rate."""
-    found = [tables.topics[name] for name in GPS_TOPICS if name in tables.topics]
-    return max(found, key=len) if found else None
+def _receivers(tables: Tables) -> Mapping[int, TopicTable]:
+    """The receivers by the topic with most fixes: firmware logs them and the blended one, each at its own rate."""
+    found = [dict(sorted(tables.instances[name].items())) for name in GPS_TOPICS if name in tables.instances]
+    return max(found, key=_fixes, default={})
+
+
+def _fixes(receivers: Mapping[int, TopicTable]) -> tuple[int, int]:
+    """Fixes, and records, of the receiver with most."""
+    return max((fixes_of(table), len(table)) for table in receivers.values())
 
 
 def _reference(local: TopicTable) -> GeodeticPoint | None:
@@ -137,13 +146,13 @@ def _reference(local: TopicTable) -> GeodeticPoint | None:
     return GeodeticPoint(lat_deg, lon_deg, alt_m) if abs(lat_deg) <= 90.0 and abs(lon_deg) <= 180.0 else None
 
 
-def _first_fix(gps: TopicTable | None) -> GeodeticPoint | None:
-    if gps is None or "fix_type" not in gps.columns:
+def _first_fix(gps: TopicTable) -> GeodeticPoint | None:
+    if "fix_type" not in gps.columns:
         return None
     where = degrees(gps)
     if where is None:
         return None
-    fixed = (gps.columns["fix_type"] >= _FIX_3D) & np.isfinite(where).all(axis=1)
+    fixed = (gps.columns["fix_type"] >= FIX_3D) & np.isfinite(where).all(axis=1)
     if not fixed.any():
         return None
     lat_deg, lon_deg, alt_m = (float(value) for value in where[int(np.argmax(fixed)), :3])
@@ -152,11 +161,13 @@ def _first_fix(gps: TopicTable | None) -> GeodeticPoint | None:
 
 def _unix(tables: Tables) -> UnixZero:
     """From the receiver's UTC, else from an exchange of time with a companion whose clock is Unix time."""
-    gps = _gps_table(tables)
-    if gps is not None and "time_utc_usec" in gps.columns:
+    for gps in _receivers(tables).values():
+        if "time_utc_usec" not in gps.columns:
+            continue
         utc_us = gps.columns["time_utc_usec"]
         known = utc_us > UNIX_US
-        pairs = list(zip((gps.timestamp_us[known] * 1e-6).tolist(), (utc_us[known] * 1e-6).tolist(), strict=True))
+        utc_s = map(since_earliest, (utc_us[known] * 1e-6).tolist())
+        pairs = list(zip((gps.timestamp_us[known] * 1e-6).tolist(), utc_s, strict=True))
         line = fitted(pairs)
         if line is not None:
             return UnixZero(line[0], math.hypot(line[2], RECEIVER_LATENCY_SIGMA_S), "gps", line[1])

@@ -13,8 +13,8 @@ import struct
 import tempfile
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO, Any
 
@@ -61,10 +61,11 @@ class TopicTable:
 
 @dataclass(frozen=True, slots=True)
 class Tables:
-    """What was kept of a log: the first instance of each topic, the parameters, and its start."""
+    """What was kept of a log: the first instance of each topic, of some all by their numbers, and the parameters."""
 
     topics: Mapping[str, TopicTable]
     parameters: Mapping[str, float]
+    instances: Mapping[str, Mapping[int, TopicTable]] = field(default_factory=dict)
 
 
 class Unpacked:
@@ -91,8 +92,10 @@ class Unpacked:
         return self._file.seek(offset, whence)
 
 
-def load_tables(path: Path, wanted: Mapping[str, tuple[str, ...]], skipped: Counter[str]) -> Tables:
-    """Read the wanted fields of the wanted topics.
+def load_tables(
+    path: Path, wanted: Mapping[str, tuple[str, ...]], skipped: Counter[str], *, several: Collection[str] = ()
+) -> Tables:
+    """Read the wanted fields of the wanted topics, all instances of ``several`` of them.
 
     ``skipped`` counts records left out and damage. Raises `LogError` if the file cannot be read or pyulog is
     not installed.
@@ -111,14 +114,18 @@ def load_tables(path: Path, wanted: Mapping[str, tuple[str, ...]], skipped: Coun
     if log.dropouts:
         skipped["dropouts of the logger"] += len(log.dropouts)
     topics: dict[str, TopicTable] = {}
+    instances: dict[str, dict[int, TopicTable]] = {}
     while log.data_list:  # one by one, so that both forms of a topic are in memory together only once
         data = log.data_list.pop()
-        if data.multi_id == 0:
-            table = _table(data.name, data.data, wanted[data.name], skipped)
-            if table is not None:
-                topics[data.name] = table
+        if data.multi_id and data.name not in several:
+            continue
+        table = _table(data.name, data.data, wanted[data.name], skipped)
+        if table is not None and data.name in several:
+            instances.setdefault(data.name, {})[data.multi_id] = table
+        elif table is not None:
+            topics[data.name] = table
     numbers = {name: value for name, value in log.initial_parameters.items() if isinstance(value, int | float)}
-    return Tables(topics, numbers)
+    return Tables(topics, numbers, instances)
 
 
 def _parsed(ulog: Any, path: Path, file: Unpacked, names: list[str]) -> Any:

@@ -28,6 +28,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.far_field import FarField
+from agent.fleet.lever_arms import has_arms, orientation_measurement
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.measurements import acceleration_measurement, gps_measurements, range_measurement
 from agent.fleet.neighbourhood import rounds_of
@@ -36,6 +37,7 @@ from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
 from agent.fleet.tracking import FleetTracker, in_layout
 from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tell, estimate_message
+from agent.sensing.gps_antenna import at_body
 from agent.sensing.latency import GpsLatency
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.sensing.timeline import TickInput, Timeline, tick_of
@@ -82,6 +84,7 @@ class AgentCore:
     ) -> None:
         self._config = config
         self._agent_id = agent_id
+        self._own = config.agent(agent_id)
         self._period_s = config.fleet.period_s
         self.layout = Layout(config.ids)
         """Of all who may come: that of the estimates handed out."""
@@ -137,9 +140,16 @@ class AgentCore:
         if not self._plausible("gps", sample.t_s, now_s):
             return
         self._note_fix(now_s)
-        corrected = self.gps_latency.on_fix(sample)
+        corrected = self.gps_latency.on_fix(self._at_body(sample))
         for record in gps_measurements(self._agent_id, corrected, self._period_s, self._config.sensors):
             self._on_own_record(record)
+
+    def _at_body(self, sample: GpsSample) -> GpsSample:
+        """A fix less the lever arm of its antenna."""
+        arms = self._own.gps_antennas_m
+        if sample.receiver >= len(arms):
+            return sample
+        return at_body(sample, arms[sample.receiver], self.timeline.orientation_at(self.gps_latency.taken_s(sample)))
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
         """A range that this agent's module measured."""
@@ -277,6 +287,10 @@ class AgentCore:
         self._input = self.timeline.close(self._tick)
         self.gps_latency.on_tick(self._input)
         self._on_own_record(acceleration_measurement(self._agent_id, self._input))
+        if has_arms(self._own):
+            orientation = self.timeline.orientation_at(self._tick * self._period_s)
+            if orientation is not None:
+                self._on_own_record(orientation_measurement(self._agent_id, self._tick, orientation))
         self._tell_records(0, now_s, outputs)
         self._phase = _Phase.PACKETS
 

@@ -92,7 +92,8 @@ class OnboardAgent:
         kind = parse_endpoint(config.agent(agent_id).mavlink).kind
         datagrams = kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
         self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
-        self.uwb = UwbAdapter(agent_id, config.ids, config.sensors)
+        antennas = {agent.id: len(agent.uwb_tags_m) for agent in config.agents if agent.uwb_tags_m}
+        self.uwb = UwbAdapter(agent_id, config.ids, config.sensors, antennas)
         shared = shared_settings(config)
         self.opener = Opener(
             config.fleet.name,

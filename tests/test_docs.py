@@ -359,7 +359,9 @@ def test_the_budget_of_the_wire_is_that_of_the_codecs() -> None:
     assert budget("own ticks in one packet") == [MAX_DATAGRAM_BODY_BYTES // s for s in own]
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
     told = re.findall(
-        r"position (\d+), velocity (\d+), speed (\d+), range (\d+), anchor range (\d+), accel\w+ (\d+)", page
+        r"position (\d+), velocity (\d+), speed (\d+), range (\d+), anchor range (\d+), acceleration (\d+), and with "
+        r"\S+ \S+ orientation (\d+), range between antennas (\d+), speed of an antenna (\d+)",
+        page,
     )
     assert [int(size) for size in told[0]] == [sizes[kind] for kind in MeasurementKind]
     pairs = [content_bytes(n, double=False) for n in (3, 5, 10)]

@@ -16,9 +16,11 @@ def shared_settings(config: FleetConfig) -> Agreement:
     """
     fleet, estimator = config.fleet, config.estimator
     origin = fleet.origin
+    tags_m = {a.id: [list(map(float, tag)) for tag in a.uwb_tags_m] for a in config.agents if a.uwb_tags_m}
     edges = None if fleet.edges is None else sorted({(min(pair), max(pair)) for pair in fleet.edges})
     return agreement_of({
         "agents.id": _listed(map(str, sorted(config.ids))),
+        "agents.uwb_tags_m": _listed(f"{agent_id}:{tags}" for agent_id, tags in sorted(tags_m.items())),
         "estimator.kind": estimator.kind,
         "estimator.relay_hops": str(estimator.relay_hops),
         "estimator.rounds": str(estimator.rounds),

@@ -16,6 +16,8 @@ NAME_RULE = "1 to 32 of the characters a-z, 0-9, - and _"
 Name = Annotated[str, msgspec.Meta(pattern=r"^[a-z0-9_-]{1,32}$", description=NAME_RULE)]
 Point = tuple[float, float, float]
 """NED metres in the fleet frame."""
+LeverArm = tuple[float, float, float]
+"""Metres from the IMU, in body axes: front, right, down."""
 
 
 class Table(msgspec.Struct, frozen=True, forbid_unknown_fields=True, kw_only=True):

@@ -9,13 +9,14 @@ from typing import Annotated, Literal
 
 import msgspec
 
-from agent.config.fields import AgentId, Fraction, Name, NotNegative, Point, Positive, Seed, Table
+from agent.config.fields import AgentId, Fraction, LeverArm, Name, NotNegative, Point, Positive, Seed, Table
 from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable
 from agent.config.other_tables import OtherTables
 from agent.config.security_table import SecurityTable
 from agent.radio.radio_faults import FaultsTable
 from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
 from estimators.settings import EstimatorSettings, default_settings
+from transport.messages.uwb_body import MAX_TAGS
 
 JOINT_BODIES = 10
 """Default of `fleet.joint_bodies`."""
@@ -70,6 +71,11 @@ class AgentTable(Table, frozen=True):
     """What flies it; auto = seen from its heartbeat."""
     system_id: Annotated[int, msgspec.Meta(ge=1, le=255)] | None = None
     """MAVLink system id of the autopilot; absent = the agent's id (255 at most)."""
+    gps_antennas_m: tuple[LeverArm, ...] = ()
+    """Where the antennas of its GPS receivers are, in their order, from the IMU in body axes (front, right, down);
+    absent = at the IMU."""
+    uwb_tags_m: Annotated[tuple[LeverArm, ...], msgspec.Meta(max_length=MAX_TAGS)] = ()
+    """Where the antennas of its UWB module are, by tag index, likewise."""
     radio: str | None = None
     """Address of this agent on the fleet's radio, IP or name; absent = its neighbours dial what it listens on."""
     listen: tuple[str, ...] | None = None

@@ -13,6 +13,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import VELOCITY_SIGMA_MPS
+from agent.fleet.lever_arms import LeverArms
 from agent.fleet.motions import MEMORY_TICKS, Motions
 from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
@@ -20,7 +21,7 @@ from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
-from transport.messages.measurement_body import Measurement, RangeMeasurement
+from transport.messages.measurement_body import Measurement, OrientationMeasurement, RangeMeasurement
 
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
@@ -39,6 +40,7 @@ class RangeLocator:
         self._period_s = config.fleet.period_s
         self._ranges: deque[RangeMeasurement] = deque(maxlen=4096)
         self._motions = motions
+        self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
         self._monitor = RangeLocationMonitor()
         self.findings: dict[int, tuple[Finding, ...]] = {}
@@ -48,6 +50,8 @@ class RangeLocator:
         """Take in a record, own or heard."""
         if isinstance(record, RangeMeasurement):
             self._ranges.append(record)
+        elif isinstance(record, OrientationMeasurement):
+            self._arms.note(record)
 
     def note_places(self, tick: int, known: _Known) -> None:
         """Take in where the located drones are at a tick, and forget what is old."""
@@ -55,6 +59,7 @@ class RangeLocator:
         oldest = tick - MEMORY_TICKS
         for old in [each for each in self._known if each < oldest]:
             del self._known[old]
+        self._arms.forget(oldest)
         while self._ranges and self._ranges[0].tick < oldest:
             self._ranges.popleft()
 
@@ -86,13 +91,15 @@ class RangeLocator:
         anchors, leads, shifts, values, variances = [], [], [], [], []
         for record, other, (mean, covariance) in usable:
             back = at_tick - record.tick
-            anchors.append(mean[:3] + record.offset_s * mean[3:])
+            shift = self._arms.shift(record)
+            side = 1.0 if record.observer == other else -1.0
+            anchors.append(mean[:3] + record.offset_s * mean[3:] + side * np.array(shift.arm_m))
             leads.append(record.offset_s - back * self._period_s)
             shifts.append(moved[back])
             values.append(record.range_m)
             # an error that all ranges to a drone share does not average out over their number
             shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
-            variances.append(record.variance_m2 + shared + wandered[back])
+            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[back])
         ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
         return multilaterate(ranges, VELOCITY_SIGMA_MPS)
 

@@ -7,6 +7,7 @@ from collections.abc import Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
+from agent.fleet.lever_arms import LeverArms
 from agent.fleet.measurements import inputs_of, rows_of
 from agent.fleet.neighbourhood import Neighbourhood
 from estimators.model.measurements import InputTable, RowTable
@@ -16,6 +17,7 @@ from transport.messages.measurement_body import (
     AccelerationMeasurement,
     Measurement,
     Measurements,
+    OrientationMeasurement,
     RangeMeasurement,
     as_sent,
 )
@@ -23,6 +25,8 @@ from transport.messages.measurement_body import (
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
 ECHOES_REMEMBERED = 64
+ATTITUDE_TICKS = 3
+"""So long a range waits to hear how its ends lay, if their antennas are off their bodies; then it counts for less."""
 AHEAD_TICKS = 2
 """Records of a neighbour whose clock is ahead by more are refused."""
 
@@ -80,6 +84,7 @@ class MeasurementStore:
         self._history_ticks = config.transport.history_ticks
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
+        self._arms = LeverArms(config)
         self._kept: dict[int, dict[bytes, _Kept]] = {}
         """The records taken in, by tick and identity."""
         self._to_send: dict[int, _OnItsWay] = {}
@@ -91,6 +96,8 @@ class MeasurementStore:
         self._rows: list[Measurement] = []
         self._inputs: list[AccelerationMeasurement] = []
         self.refused: Counter[str] = Counter()
+        self.unturned = 0
+        """Ranges that were used without knowing where their antennas pointed."""
 
     def add_own(self, record: Measurement) -> Measurement | None:
         """Take in a record of our own sensors; it comes back as the wire rounds it, ``None`` if refused."""
@@ -135,13 +142,22 @@ class MeasurementStore:
         for record in self._rows:
             end = _far_end(record)
             ready = record.tick <= tick and record.observer in usable and end in usable
-            (rows if ready else later).append(record)
+            (rows if ready and self._is_turned(record, tick) else later).append(record)
         later_inputs: list[AccelerationMeasurement] = []
         for push in self._inputs:
             (inputs if push.tick < tick and push.observer in slots else later_inputs).append(push)
         self._rows, self._inputs = later, later_inputs
+        table = rows_of(rows, slots, self._arms)
         self.forget(tick)
-        return rows_of(rows, slots), inputs_of(inputs, slots)
+        return table, inputs_of(inputs, slots)
+
+    def _is_turned(self, record: Measurement, tick: int) -> bool:
+        """Whether it is known how the ends of a range lay, or it has waited for that long enough."""
+        if not isinstance(record, RangeMeasurement) or self._arms.knows(record):
+            return True
+        waited = tick - record.tick >= min(ATTITUDE_TICKS, self._hold_ticks)
+        self.unturned += waited
+        return waited
 
     def let_go_beyond(self, wanted: Container[int]) -> None:
         """Let go what names somebody who is not wanted in the joint state: it would wait in vain."""
@@ -158,6 +174,7 @@ class MeasurementStore:
             self.refused["not located"] += len(self._rows) - len(waiting)
         self._rows = waiting
         self._inputs = [record for record in self._inputs if record.tick >= first]
+        self._arms.forget(first)
         for old in [t for t in self._kept if t < tick - KEEP_TICKS]:
             self._kept.pop(old)
             self._to_send.pop(old, None)
@@ -262,6 +279,8 @@ class MeasurementStore:
             on_its_way.add(kept, is_own=is_own)
         if isinstance(record, AccelerationMeasurement):
             self._inputs.append(record)
+        elif isinstance(record, OrientationMeasurement):
+            self._arms.note(record)
         else:
             self._rows.append(record)
         return kept

@@ -16,6 +16,7 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from agent.config.tables import SensorsTable
+from agent.fleet.lever_arms import LeverArms, Shift
 from agent.sensing.samples import GpsSample, RangeSample, Triple
 from agent.sensing.timeline import TickInput, nearest_tick
 from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
@@ -23,10 +24,13 @@ from transport.messages.measurement_body import (
     NO_BOUND,
     AccelerationMeasurement,
     AnchorRangeMeasurement,
+    AntennaSpeedMeasurement,
     Measurement,
+    OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
     SpeedMeasurement,
+    TagRangeMeasurement,
     VelocityMeasurement,
 )
 
@@ -69,7 +73,9 @@ def _speed_records(
     variance = sample.speed_sigma_mps**2 if half_width is None else half_width**2 / 3
     bound = math.inf if half_width is None else half_width
     if sample.speed_mps is not None:
-        return [SpeedMeasurement(observer, tick, sample.speed_mps, variance, bound, offset_s)]
+        said = observer, tick, sample.speed_mps, variance, bound, offset_s
+        moves = any(sample.shift_mps)
+        return [AntennaSpeedMeasurement(*said, sample.shift_mps) if moves else SpeedMeasurement(*said)]
     if sample.ground_velocity_mps is not None:
         north, east = sample.ground_velocity_mps
         variances = (variance, variance, UNMEASURED_VARIANCE)
@@ -85,7 +91,10 @@ def range_measurement(sample: RangeSample, period_s: float, sensors: SensorsTabl
     variance = sample.sigma_m**2 if bound is None else bound**2 / 3
     half_width = math.inf if bound is None else bound
     offset_s = sample.t_s - tick * period_s
-    return RangeMeasurement(sample.observer, tick, sample.target, sample.range_m, variance, half_width, offset_s)
+    said = sample.observer, tick, sample.target, sample.range_m, variance, half_width, offset_s
+    if sample.tag or sample.other_tag:
+        return TagRangeMeasurement(*said, sample.tag, sample.other_tag)
+    return RangeMeasurement(*said)
 
 
 def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
@@ -93,11 +102,13 @@ def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMe
     return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)
 
 
-def rows_of(records: Iterable[Measurement], slots: Mapping[int, int]) -> RowTable:
-    """The rows of records of sensors, in their order; ``slots`` by agent id.
+def rows_of(
+    records: Iterable[Measurement], slots: Mapping[int, int], arms: LeverArms | None = None
+) -> RowTable:
+    """The rows of records of sensors, in their order; ``slots`` by agent id, ``arms`` where antennas have any.
 
     None is surer than `LEAST_SIGMA`. All in one table at once: numpy takes as long for a table of one row as for ten.
-    Raises `TypeError` for an acceleration, which is an input.
+    Raises `TypeError` for an acceleration, which is an input, and for an orientation, which turns arms.
     """
     rows: list[_Row] = []
     for record in records:
@@ -111,15 +122,18 @@ def rows_of(records: Iterable[Measurement], slots: Mapping[int, int]) -> RowTabl
                 rows += _axis_rows(Kind.VELOCITY, tick, offset_s, slot, axes)
             case SpeedMeasurement():
                 noise = record.variance_m2ps2, record.half_width_mps
-                rows.append((tick, record.offset_s, record.speed_mps, *noise, *_NOWHERE, Kind.SPEED, slot, -1, slot))
+                shift = record.shift_mps if isinstance(record, AntennaSpeedMeasurement) else _NOWHERE
+                rows.append((tick, record.offset_s, record.speed_mps, *noise, *shift, Kind.SPEED, slot, -1, slot))
             case RangeMeasurement():
-                noise, other = (record.variance_m2, record.half_width_m), slots[record.other]
-                rows.append((tick, record.offset_s, record.range_m, *noise, *_NOWHERE, Kind.RANGE, slot, other, slot))
+                between = Shift() if arms is None else arms.shift(record)
+                noise, other = (record.variance_m2 + between.variance_m2, record.half_width_m), slots[record.other]
+                ends = Kind.RANGE, slot, other, slot
+                rows.append((tick, record.offset_s, record.range_m, *noise, *between.arm_m, *ends))
             case AnchorRangeMeasurement():
                 noise, kind = (record.variance_m2, record.half_width_m), Kind.ANCHOR_RANGE
                 rows.append((tick, record.offset_s, record.range_m, *noise, *record.anchor_m, kind, slot, -1, slot))
-            case AccelerationMeasurement():
-                raise TypeError(f"an acceleration is an input, not a measurement: {record}")
+            case AccelerationMeasurement() | OrientationMeasurement():
+                raise TypeError(f"not a measurement that makes rows: {record}")
     table = np.array(rows, ROW)
     np.maximum(table["variance"], LEAST_SIGMA**2, out=table["variance"])
     return table

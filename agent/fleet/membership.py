@@ -29,7 +29,12 @@ from estimators.model.measurements import Vector
 from estimators.model.unknown_motion import silence_sigma_m
 from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
-from transport.messages.measurement_body import AccelerationMeasurement, Measurement, RangeMeasurement
+from transport.messages.measurement_body import (
+    AccelerationMeasurement,
+    Measurement,
+    OrientationMeasurement,
+    RangeMeasurement,
+)
 from transport.messages.window_body import WindowStates
 
 ATTEMPT_EVERY_TICKS = 3
@@ -92,6 +97,8 @@ class Membership:
             self._heard[record.observer] = when
         if isinstance(record, AccelerationMeasurement):
             self._motions.note(record)
+        elif isinstance(record, OrientationMeasurement):
+            self._locator.note(record)
         elif isinstance(record, RangeMeasurement):
             self._locator.note(record)
             pair = _pair(record.observer, record.other)

@@ -94,6 +94,10 @@ class GpsLatency:
         """1-sigma of ``latency_s``: the prior's without manoeuvres, 0 if it is known exactly."""
         return None if self._current is None else self._known(self._current)[1]
 
+    def taken_s(self, sample: GpsSample) -> float:
+        """Fleet time of the instant that a fix is of, as far as that is known by now."""
+        return sample.t_s - self._known(sample.latency)[0]
+
     def on_fix(self, sample: GpsSample) -> GpsSample:
         """Take in a fix; it comes back at the instant that it is of, as far as that is known by now.
 

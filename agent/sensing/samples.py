@@ -53,7 +53,8 @@ class GpsSample:
 
     ``t_s`` is what its stamp says; the value is older by ``latency`` (`agent.latency.gps_prior`).
     ``ground_velocity_mps`` (north, east) or ``speed_mps`` (norm of the velocity), whichever the receiver
-    gives; ``fix_type`` as in MAVLink (3 = 3-D).
+    gives; ``fix_type`` as in MAVLink (3 = 3-D). ``receiver`` counts the drone's receivers from 0; ``shift_mps`` says
+    how its antenna moves against the body, NED, where ``speed_mps`` is that of the antenna.
     """
 
     t_s: float
@@ -65,17 +66,21 @@ class GpsSample:
     speed_sigma_mps: float
     fix_type: int
     latency: LatencyPrior = NO_LATENCY
+    receiver: int = 0
+    shift_mps: Triple = (0.0, 0.0, 0.0)
 
 
 @dataclass(frozen=True, slots=True)
 class RangeSample:
-    """A range in m from agent ``observer`` to agent ``target``, 1-sigma in m."""
+    """A range in m from agent ``observer`` to agent ``target``, 1-sigma in m; of which of their antennas."""
 
     t_s: float
     observer: int
     target: int
     range_m: float
     sigma_m: float
+    tag: int = 0
+    other_tag: int = 0
 
 
 @dataclass(frozen=True, slots=True)

@@ -68,6 +68,14 @@ class TickInput:
     """Whether the attitudes were those of an autopilot with positions."""
 
 
+@dataclass(frozen=True, slots=True)
+class Orientation:
+    """How a body lies and turns at an instant: the quaternion into NED, the turn rate in body rad/s."""
+
+    quaternion: Quaternion
+    rate_radps: Triple
+
+
 class _Limit:
     """Notices an accelerometer at its limit: a component that had noise stays what it is, and large."""
 
@@ -152,6 +160,18 @@ class Timeline:
         variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2 + tilted
         north, east, down = (component / covered_s for component in integral)
         return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside, aided)
+
+    def orientation_at(self, t_s: float) -> Orientation | None:
+        """How the body lies and turns at an instant; ``None`` without an attitude close enough."""
+        rate = self._rate_at(t_s)
+        quaternion = self.attitude_at(t_s, rate)
+        return None if quaternion is None else Orientation(quaternion, rate)
+
+    def _rate_at(self, t_s: float) -> Triple:
+        """The turn rate of the nearest IMU sample, body rad/s; zero where there is none of late."""
+        after = bisect_left(self._imu, t_s, key=_time_of)
+        near = [s for s in self._imu[max(after - 1, 0) : after + 1] if abs(s.t_s - t_s) <= ATTITUDE_MAX_AGE_S]
+        return min(near, key=lambda s: abs(s.t_s - t_s)).gyro_radps if near else (0.0, 0.0, 0.0)
 
     def attitude_at(self, t_s: float, gyro_radps: Triple) -> Quaternion | None:
         """The attitude at an instant; ``None`` without a sample close enough.

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 from dataclasses import replace
 
 from agent.config.tables import SensorsTable
 from agent.sensing.samples import RangeSample
-from transport.messages.uwb_body import UwbFrame, UwbIntake, UwbRange
+from transport.messages.uwb_body import MAX_TAGS, UwbFrame, UwbIntake, UwbRange
 
 NLOS_REJECT_DB = 10.0
 NLOS_SUSPECT_DB = 6.0
@@ -26,7 +26,11 @@ class UwbAdapter:
     refused above 10 dB and trusted a third as much above 6 dB (the rule of thumb for DW1000 radios).
     """
 
-    def __init__(self, observer: int, others: Collection[int], sensors: SensorsTable) -> None:
+    def __init__(
+        self, observer: int, others: Collection[int], sensors: SensorsTable, antennas: Mapping[int, int] | None = None
+    ) -> None:
+        """``antennas``: how many are configured, by agent; who is not in it may have any."""
+        self._antennas = antennas or {}
         self._observer = observer
         self._others = frozenset(others)
         self._sensors = sensors
@@ -70,6 +74,8 @@ class UwbAdapter:
         t_s = measured_s + entry.offset_s
         if entry.other not in self._others:
             return self._skip("not a neighbour")
+        if not self._has_tag(self._observer, entry.tag) or not self._has_tag(entry.other, entry.other_tag):
+            return self._skip("unknown tag")
         if t_s > now_s + MAX_LEAD_S:
             return self._skip("wrong time")
         weakness_db = 0.0
@@ -80,7 +86,12 @@ class UwbAdapter:
         if weakness_db > NLOS_SUSPECT_DB or (entry.nlos or 0.0) > NLOS_SUSPECT_PROBABILITY:
             sigma_m *= NLOS_SIGMA_FACTOR
         sigma_m = max(sigma_m, self._sensors.uwb_sigma_floor_m)
-        return RangeSample(t_s, self._observer, entry.other, entry.range_m, sigma_m)
+        return RangeSample(
+            t_s, self._observer, entry.other, entry.range_m, sigma_m, entry.tag, entry.other_tag
+        )
+
+    def _has_tag(self, agent_id: int, tag: int) -> bool:
+        return tag < self._antennas.get(agent_id, MAX_TAGS)
 
     def _skip(self, reason: str) -> RangeSample | None:
         self.skipped[reason] += 1

@@ -89,6 +89,7 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
         "packets sent": onboard.sealer.sent,
         "packets unsent": onboard.unsent.total(),
         "records left out": onboard.sealer.left_out,
+        "range: attitude unknown": core.records.unturned,
         "packets received": sum(peer.received for _, peer in opener.peers.items()),
         "packets lost": sum(peer.lost for _, peer in opener.peers.items()),
     }

@@ -28,9 +28,10 @@ class Kind(IntEnum):
     VELOCITY = 1
     """``direction . v`` in m/s."""
     SPEED = 2
-    """``sqrt(|v|^2 + eps^2)`` in m/s."""
+    """``sqrt(|v + s|^2 + eps^2)`` in m/s; ``x, y, z`` is s, what the antenna moves against the body."""
     RANGE = 3
-    """``sqrt(|p_agent - p_other|^2 + eps^2)``, both at the row's instant, in m."""
+    """``sqrt(|p_agent - p_other + s|^2 + eps^2)``, both at the row's instant, in m; ``x, y, z`` is s, the lever arm
+    of the one end's antenna less that of the other's."""
     ANCHOR_RANGE = 4
     """``sqrt(|p_agent - anchor|^2 + eps^2)`` in m; the anchor is in ``x, y, z``."""
 
@@ -42,7 +43,7 @@ ROW = np.dtype(
         ("value", np.float64),  # m or m/s
         ("variance", np.float64),  # of the noise, unit of value squared
         ("half_width", np.float64),  # hard bound on the noise; inf where the sensor has none
-        ("x", np.float64),  # unit direction (POSITION, VELOCITY) or anchor in NED m (ANCHOR_RANGE)
+        ("x", np.float64),  # unit direction (POSITION, VELOCITY), anchor (ANCHOR_RANGE) or shift s (others), NED
         ("y", np.float64),
         ("z", np.float64),
         ("kind", np.int32),
@@ -62,6 +63,12 @@ INPUT = np.dtype(
     ],
     align=True,
 )
+
+
+def is_shifted(rows: RowTable) -> bool:
+    """Whether ranges between agents or speeds are of antennas beside the bodies."""
+    of_antennas = rows[(rows["kind"] == Kind.RANGE) | (rows["kind"] == Kind.SPEED)]
+    return any(bool(of_antennas[axis].any()) for axis in ("x", "y", "z"))
 
 
 def empty_rows() -> RowTable:
@@ -167,8 +174,13 @@ def speed_row(
     *,
     offset_s: float = 0.0,
     half_width_mps: float = np.inf,
+    shift_mps: ArrayLike = (0.0, 0.0, 0.0),
 ) -> RowTable:
-    """The row of a speed norm in m/s (second line of Borelle et al. 2023, eq. 28)."""
+    """The row of a speed norm in m/s (second line of Borelle et al. 2023, eq. 28).
+
+    ``shift_mps`` ``(3,)`` NED: velocity of the antenna against the body's.
+    """
+    shift = np.asarray(shift_mps, float)
     return _rows(
         1,
         kind=Kind.SPEED,
@@ -177,6 +189,9 @@ def speed_row(
         value=speed_mps,
         variance=variance,
         half_width=half_width_mps,
+        x=shift[0],
+        y=shift[1],
+        z=shift[2],
         agent=agent,
         observer=agent,
     )
@@ -191,8 +206,13 @@ def range_row(
     *,
     offset_s: float = 0.0,
     half_width_m: float = np.inf,
+    shift_m: ArrayLike = (0.0, 0.0, 0.0),
 ) -> RowTable:
-    """The row of a range in m between two agents, measured by ``observer`` (Borelle et al. 2023, eq. 29)."""
+    """The row of a range in m between two agents, measured by ``observer`` (Borelle et al. 2023, eq. 29).
+
+    ``shift_m`` ``(3,)`` NED: lever arm of the observer's antenna less that of the target's.
+    """
+    shift = np.asarray(shift_m, float)
     return _rows(
         1,
         kind=Kind.RANGE,
@@ -201,6 +221,9 @@ def range_row(
         value=range_m,
         variance=variance,
         half_width=half_width_m,
+        x=shift[0],
+        y=shift[1],
+        z=shift[2],
         agent=observer,
         other=target,
         observer=observer,

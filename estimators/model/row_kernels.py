@@ -88,9 +88,9 @@ def predict_row(code: IntArray, data: Matrix, r: int, x: Vector, eps: float, uni
         unit[3] = 0.0
         return float(unit[0] * x[a + 3] + unit[1] * x[a + 4] + unit[2] * x[a + 5])
     if kind == SPEED:
-        e0 = x[a + 3]
-        e1 = x[a + 4]
-        e2 = x[a + 5]
+        e0 = x[a + 3] + data[r, X]
+        e1 = x[a + 4] + data[r, Y]
+        e2 = x[a + 5] + data[r, Z]
     else:
         e0 = x[a] + offset * x[a + 3]
         e1 = x[a + 1] + offset * x[a + 4]
@@ -103,9 +103,9 @@ def predict_row(code: IntArray, data: Matrix, r: int, x: Vector, eps: float, uni
             return float(unit[0] * e0 + unit[1] * e1 + unit[2] * e2)
         if kind == RANGE:
             b = code[r, 2]
-            e0 -= x[b] + offset * x[b + 3]
-            e1 -= x[b + 1] + offset * x[b + 4]
-            e2 -= x[b + 2] + offset * x[b + 5]
+            e0 -= x[b] + offset * x[b + 3] - data[r, X]
+            e1 -= x[b + 1] + offset * x[b + 4] - data[r, Y]
+            e2 -= x[b + 2] + offset * x[b + 5] - data[r, Z]
         else:
             e0 -= data[r, X]
             e1 -= data[r, Y]

@@ -37,9 +37,9 @@ def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps:
     bent = np.empty((3, 3))
     a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
     b = STATES_PER_AGENT * row["other"]  # negative for anchors
-    anchor = (row["x"], row["y"], row["z"])
+    anchor = (row["x"], row["y"], row["z"])  # or, between agents, the shift of the one against the other
     for i in range(3):
-        there = state[b + i] + o * state[b + 3 + i] if b >= 0 else anchor[i]
+        there = state[b + i] + o * state[b + 3 + i] - anchor[i] if b >= 0 else anchor[i]
         away[i] = state[a + i] + o * state[a + 3 + i] - there
         for j in range(3):
             middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)

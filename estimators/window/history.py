@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
 import numpy as np
@@ -20,6 +21,8 @@ from estimators.model.members import MemberChange
 from estimators.model.row_kernels import IntArray, mark_usable
 from estimators.window.inputs import InputHistory
 
+SAME_ANTENNAS_M = 0.05
+"""Antennas of one drone are further apart; an arm turns by less between the times that both ends give a range."""
 _NEVER = np.iinfo(np.int64).min
 """Of an agent of which nothing was heard."""
 
@@ -214,13 +217,19 @@ def _is_before(a: np.void, b: np.void) -> bool:
 
 
 def _seen_from_other_end(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Ranges whose exchange is in the table from its lower end too: one exchange, one measurement."""
+    """Ranges whose exchange is in the table from its lower end too: one exchange, one measurement.
+
+    Two between other antennas of the same agents are two measurements.
+    """
     between = np.flatnonzero(rows["kind"] == Kind.RANGE)
     drop = np.zeros(len(rows), np.bool_)
-    agent, other, tick = rows["agent"][between], rows["other"][between], rows["tick"][between]
-    lower = {(int(t), int(a), int(b)) for t, a, b in zip(tick, agent, other, strict=True) if a < b}
-    for at, t, a, b in zip(between, tick, agent, other, strict=True):
-        drop[at] = a > b and (int(t), int(b), int(a)) in lower
+    ranges = rows[["tick", "agent", "other", "x", "y", "z"]][between].tolist()
+    lower: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
+    for t, a, b, *shift in ranges:
+        if a < b:
+            lower.setdefault((t, a, b), []).append((-shift[0], -shift[1], -shift[2]))
+    for at, (t, a, b, *shift) in zip(between, ranges, strict=True):
+        drop[at] = any(math.dist(seen, shift) < SAME_ANTENNAS_M for seen in lower.get((t, b, a), ()))
     return drop
 
 

@@ -246,7 +246,8 @@ def _ranges(
         flown = {vehicle.agent_id for vehicle in plan.vehicles}
         neighbours = {a: tuple(b for b in config.neighbours(a) if b in flown) for a in config.ids if a in flown}
         made_of = f"synthetic ranges: {noise.described()}, seed {options.seed}"
-        return Synthesiser(neighbours, noise, options.seed), made_of
+        arms_m = {agent.id: agent.uwb_tags_m[0] for agent in config.agents if agent.uwb_tags_m}
+        return Synthesiser(neighbours, noise, options.seed, arms_m), made_of
     paths = [Path(text) for text in options.ranges]
     streams = []
     for path in paths:

@@ -149,7 +149,7 @@ class Replay:
             self._counts.ranges["observer without a log"] += 1
             return
         self._sequence += 1
-        measured = UwbRange(line.target, line.range_m, line.sigma_m)
+        measured = UwbRange(line.target, line.range_m, line.sigma_m, tag=line.tag, other_tag=line.other_tag)
         frame = UwbFrame(self._sequence, "unix", 0, (measured,), line.observer)
         now_s = self._queue.now_s
         drone.agent.on_uwb_frame(frame, now_s - line.time_s, now_s)

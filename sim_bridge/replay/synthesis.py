@@ -12,6 +12,7 @@ from collections.abc import Iterator, Mapping
 import msgspec
 import numpy as np
 
+from agent.sensing.frames import interpolated, rotated
 from agent.sensing.samples import Triple
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.logs.events import TruthSample
@@ -80,7 +81,15 @@ class Synthesiser:
     nothing for the others.
     """
 
-    def __init__(self, neighbours: Mapping[int, tuple[int, ...]], noise: SyntheticNoise, seed: int) -> None:
+    def __init__(
+        self,
+        neighbours: Mapping[int, tuple[int, ...]],
+        noise: SyntheticNoise,
+        seed: int,
+        arms_m: Mapping[int, Triple] | None = None,
+    ) -> None:
+        """``arms_m``: where the modules' antennas are in body axes, by agent; others are at the body."""
+        self._arms = {agent: arm for agent, arm in (arms_m or {}).items() if any(arm)}
         self._neighbours = dict(neighbours)
         self._noise = noise
         self._tracks: dict[int, list[TruthSample]] = {}
@@ -98,6 +107,9 @@ class Synthesiser:
     def on_truth(self, agent_id: int, sample: TruthSample) -> Iterator[RangeLine]:
         """Note where an agent was; gives the ranges of which both ends are known now, in order of time."""
         if agent_id not in self._neighbours or not sample.has_height:
+            return iter(())
+        if agent_id in self._arms and sample.quaternion is None:
+            self.made["no attitude"] += 1
             return iter(())
         track = self._tracks.setdefault(agent_id, [])
         if track and sample.t_s <= track[-1].t_s:
@@ -155,8 +167,17 @@ class Synthesiser:
             if before.t_s <= t_s <= after.t_s:
                 if after.t_s - before.t_s > MAX_GAP_S:
                     return None
-                return _between(before, after, (t_s - before.t_s) / (after.t_s - before.t_s))
+                share = (t_s - before.t_s) / (after.t_s - before.t_s)
+                return self._at_antenna(agent_id, before, after, share)
         return None
+
+    def _at_antenna(self, agent_id: int, before: TruthSample, after: TruthSample, share: float) -> Triple:
+        """Where the antenna of an agent's module was between two samples."""
+        place, arm = _between(before, after, share), self._arms.get(agent_id)
+        if arm is None or before.quaternion is None or after.quaternion is None:
+            return place
+        north, east, down = rotated(interpolated(before.quaternion, after.quaternion, share), arm)
+        return place[0] + north, place[1] + east, place[2] + down
 
 
 def _between(before: TruthSample, after: TruthSample, share: float) -> Triple:

@@ -14,12 +14,13 @@ from array import array
 import numpy as np
 
 from agent.config.tables import FleetConfig
+from agent.fleet.lever_arms import has_arms
 from sim_bridge.sitl.session import TimedTruth
 from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.sitl.truth import TRUTH_HZ
 from sim_bridge.world.guidance import default_path
 from sim_bridge.world.quaternions import Array
-from sim_bridge.world.scenario import Scenario
+from sim_bridge.world.scenario import Scenario, ScenarioError
 from sim_bridge.world.scenario_config import scenario_from_config
 from sim_bridge.world.sensors import FleetSensors, SensedRanges
 from sim_bridge.world.simulation import aligned_start
@@ -73,6 +74,8 @@ class SitlWorld:
         self.scenario: Scenario = dataclasses.replace(
             scenario_from_config(config), uwb_reach_m=sitl_table(config).uwb_reach_m
         )
+        if any(has_arms(agent) for agent in config.agents):
+            raise ScenarioError("agents.uwb_tags_m: expected none in SITL, whose truth has no tilt to turn them with")
         self.unix_offset_s = unix_offset_s
         self.tracks = {agent_id: VehicleTrack() for agent_id in config.ids}
         self._run: _Run | None = None

@@ -30,6 +30,9 @@ class Vehicle:
     start_m: Point | None = None
     start_velocity_mps: Point | None = None
     yaw_rad: float = 0.0
+    gps_antenna_m: Point = (0.0, 0.0, 0.0)
+    """From the IMU in body axes, as the tags of its UWB module are."""
+    uwb_tags_m: tuple[Point, ...] = ((0.0, 0.0, 0.0),)
     on_ground: bool = False
     clock_skew_ppm: float = 0.0
     """How much faster than true its boot clock runs."""
@@ -89,6 +92,8 @@ class Scenario:
     gps_speed: Literal["horizontal", "norm"] = "horizontal"
     """What GPS_RAW_INT.vel holds: ground speed, as receivers have it, or the velocity's norm (the paper)."""
     max_accel_mps2: float = 2.0
+    yaw_rate_radps: float = 0.0
+    """All vehicles turn at it."""
     start_position_half_width_m: float = 15.0
     """Starts are drawn from a cube of this half width about the begin of the path."""
     start_speed_half_width_mps: float = 2.0

@@ -31,6 +31,7 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         uwb_hz=sim.uwb_hz,
         uwb_staggered=sim.profile != "paper",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
+        yaw_rate_radps=sim.yaw_rate_radps,
         gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
         faults=sim.faults,
     )
@@ -38,7 +39,15 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
 
 def _vehicle(config: FleetConfig, agent: AgentTable, path: Path | None) -> Vehicle:
     flavour: FlavourName = "ardupilot" if agent.autopilot == "ardupilot" else "px4"
-    return Vehicle(agent.id, flavour, config.system_id(agent.id), path)
+    at_imu = (0.0, 0.0, 0.0)
+    return Vehicle(
+        agent.id,
+        flavour,
+        config.system_id(agent.id),
+        path,
+        gps_antenna_m=next(iter(agent.gps_antennas_m), at_imu),
+        uwb_tags_m=agent.uwb_tags_m or (at_imu,),
+    )
 
 
 def _path(table: PathTable) -> Path:

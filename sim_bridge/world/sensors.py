@@ -6,7 +6,7 @@ Every agent and sensor draws from a stream of its own, so that another sensor's 
 from __future__ import annotations
 
 import math
-from collections import deque
+from collections import Counter, deque
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -82,7 +82,7 @@ class GpsFix:
 
 @dataclass(frozen=True, slots=True)
 class SensedRange:
-    """A range to one agent; received powers in dBm, probability of no line of sight."""
+    """A range to one agent; received powers in dBm, probability of no line of sight; between which antennas."""
 
     target: int
     range_m: float
@@ -90,6 +90,8 @@ class SensedRange:
     rx_dbm: float
     first_path_dbm: float
     nlos: float
+    tag: int = 0
+    other_tag: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,6 +284,10 @@ class FleetSensors:
         self._uwb_grids = [
             _Grid(scenario.uwb_hz, cycle_s * slot / count if scenario.uwb_staggered else 0.0) for slot in range(count)
         ]
+        self._gps_antennas = np.array([vehicle.gps_antenna_m for vehicle in scenario.vehicles])
+        self._tags = [np.array(vehicle.uwb_tags_m) for vehicle in scenario.vehicles]
+        self._exchanges: Counter[tuple[int, int]] = Counter()
+        """Ranges taken so far, by the slots of observer and target: antennas take turns."""
         self._faults = SensorFaults(scenario.faults, scenario.seed)
         self._body_step = -1
         self._body_force = np.zeros((count, 3))
@@ -348,7 +354,7 @@ class FleetSensors:
 
     def _solve_all(self) -> list[GpsFix]:
         scenario, world = self._scenario, self._world
-        states = zip(world.position_m, world.velocity_mps, world.accel_mps2, strict=True)
+        states = zip(*self._antenna_states(), strict=True)
         solved = [
             receiver.solve(world.time_s, *state) for receiver, state in zip(self._receivers, states, strict=True)
         ]
@@ -358,6 +364,16 @@ class FleetSensors:
         velocities = [velocity + off_mps for (_, velocity), (_, off_mps) in both]
         places = geodesy.geodetic(scenario.frame, positions)
         return [self._fix(slot, *entry) for slot, entry in enumerate(zip(positions, velocities, places, strict=True))]
+
+    def _antenna_states(self) -> tuple[Array, Array, Array]:
+        """Position, velocity and acceleration ``(n, 3)`` NED of the GPS antennas; turn rates change slowly."""
+        world, arms = self._world, self._gps_antennas
+        if not arms.any():
+            return world.position_m, world.velocity_mps, world.accel_mps2
+        rates = world.body_rates()
+        moves = np.cross(rates, arms)
+        turned = [quaternions.rotate(world.attitude(), each) for each in (arms, moves, np.cross(rates, moves))]
+        return world.position_m + turned[0], world.velocity_mps + turned[1], world.accel_mps2 + turned[2]
 
     def _fix(self, slot: int, position: Array, velocity: Array, place: Array) -> GpsFix:
         scenario, noise, time_s = self._scenario, self._gps_noise, self._world.time_s
@@ -399,14 +415,29 @@ class FleetSensors:
         return sets
 
     def _range_all(self, slot: int, observer: int) -> list[SensedRange]:
-        positions = self._world.position_m
         measured = []
         for target in self._scenario.ranged_by(observer):
-            between = positions[self._scenario.slot(target)] - positions[slot]
+            there = self._scenario.slot(target)
+            tag, other_tag = self._turn(slot, there)
+            between = self._tag_position(there, other_tag) - self._tag_position(slot, tag)
             north, east, down = (float(axis) for axis in between)
             distance_m = math.sqrt(north * north + east * east + down * down)
             if distance_m <= self._scenario.uwb_reach_m:
                 bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
                 fault = self._faults.range_error(observer, target, self._world.time_s)
-                measured.append(self._channel.measure(observer, target, distance_m, bearing_rad, fault))
+                taken = self._channel.measure(observer, target, distance_m, bearing_rad, fault)
+                measured.append(replace(taken, tag=tag, other_tag=other_tag))
         return measured
+
+    def _turn(self, slot: int, there: int) -> tuple[int, int]:
+        """Between which antennas the next range is."""
+        turn, own = self._exchanges[slot, there], len(self._tags[slot])
+        self._exchanges[slot, there] += 1
+        return turn % own, turn // own % len(self._tags[there])
+
+    def _tag_position(self, slot: int, tag: int) -> Array:
+        """Where an antenna of a UWB module is, ``(3,)`` NED."""
+        arm, position = self._tags[slot][tag], self._world.position_m[slot]
+        if not arm.any():
+            return np.asarray(position)
+        return np.asarray(position + quaternions.rotate(self._world.attitude()[slot][None], arm[None])[0])

@@ -90,6 +90,8 @@ class SimTable(Table, frozen=True):
     uwb_module: Literal["none", "linktrack", "uci", "dwm1001", "dwm3001-cli"] = "none"
     """What measures the ranges of a live fleet: modules simulated down to their bytes, on pseudo terminals behind
     `fleetloc uwb`; or, with none, the simulator's own driver, which sends frames."""
+    yaw_rate_radps: Annotated[float, msgspec.Meta(ge=-3, le=3)] = 0.0
+    """At which all drones turn about the vertical."""
     gps_outages: tuple[GpsOutage, ...] = ()
     """When which receivers see nothing."""
     faults: tuple[FaultTable, ...] = ()
@@ -105,6 +107,8 @@ def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
         if outage.to_s <= outage.from_s:
             yield Fault(f"{key}.to_s", f"later than from_s = {outage.from_s:g}", f"{outage.to_s:g}")
     yield from wrong_settings(table.faults, config, "sim.faults")
+    if table.uwb_module != "none" and any(len(agent.uwb_tags_m) > 1 for agent in config.agents):
+        yield Fault("sim.uwb_module", '"none" where a drone has several UWB tags', f'"{table.uwb_module}"')
     flown: set[int] = set()
     for index, path in enumerate(table.paths):
         key = f"sim.paths[{index}].agent"

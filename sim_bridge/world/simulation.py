@@ -253,5 +253,6 @@ def _world(scenario: Scenario) -> FleetWorld:
         paths,
         dynamics=Dynamics(gravity_mps2=scenario.gravity, max_accel_mps2=scenario.max_accel_mps2),
         yaw_rad=np.array([vehicle.yaw_rad for vehicle in scenario.vehicles]),
+        yaw_rate_radps=scenario.yaw_rate_radps,
         on_ground=np.array([vehicle.on_ground for vehicle in scenario.vehicles]),
     )

@@ -28,6 +28,8 @@ class UwbDrivers:
                 nlos=measured.nlos,
                 rx_dbm=measured.rx_dbm,
                 first_path_dbm=measured.first_path_dbm,
+                tag=measured.tag,
+                other_tag=measured.other_tag,
             )
             for measured in ranges.ranges
             if measured.range_m <= MAX_RANGE_M

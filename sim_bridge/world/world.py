@@ -48,9 +48,13 @@ class FleetWorld:
         *,
         dynamics: Dynamics | None = None,
         yaw_rad: Array | None = None,
+        yaw_rate_radps: float = 0.0,
         on_ground: Array | None = None,
     ) -> None:
-        """Start at ``position_m`` and ``velocity_mps`` ``(n, 3)``; vehicles on the ground start at rest."""
+        """Start at ``position_m`` and ``velocity_mps`` ``(n, 3)``; vehicles on the ground start at rest.
+
+        All turn about the vertical at ``yaw_rate_radps``.
+        """
         count = len(paths)
         if position_m.shape != (count, 3) or velocity_mps.shape != (count, 3):
             raise ValueError(
@@ -62,6 +66,7 @@ class FleetWorld:
         self.velocity_mps = np.array(velocity_mps, float)
         self.accel_mps2 = np.zeros((count, 3))
         self.yaw_rad = np.zeros(count) if yaw_rad is None else np.array(yaw_rad, float)
+        self._yaw_step_rad = yaw_rate_radps / STEP_RATE_HZ
         self.landed = np.zeros(count, bool) if on_ground is None else np.array(on_ground, bool)
         self.velocity_mps[self.landed] = 0.0
         self.step_index = 0
@@ -92,6 +97,7 @@ class FleetWorld:
             self.accel_mps2[self.landed] = 0.0
         self.position_m += self.velocity_mps * self.step_s + 0.5 * self.accel_mps2 * self.step_s**2
         self.velocity_mps += self.accel_mps2 * self.step_s
+        self.yaw_rad += self._yaw_step_rad
         self.step_index += 1
 
     def _guide(self) -> None:
@@ -133,7 +139,8 @@ class FleetWorld:
         """Attitudes before and after the last step, ``(2, n, 4)``, computed when somebody looks."""
         both = np.concatenate((self._accel_before_mps2, self.accel_mps2))
         force = both - np.array((0.0, 0.0, self.dynamics.gravity_mps2))
-        return quaternions.from_thrust(force, np.concatenate((self.yaw_rad, self.yaw_rad))).reshape(2, -1, 4)
+        yaw = np.concatenate((self.yaw_rad - self._yaw_step_rad, self.yaw_rad))
+        return quaternions.from_thrust(force, yaw).reshape(2, -1, 4)
 
     def _update_attitudes(self) -> None:
         if self._attitudes_step != self.step_index:

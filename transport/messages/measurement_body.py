@@ -27,6 +27,7 @@ from transport.errors import EncodeError, Reason, Rejected
 from transport.link.streams import MAX_AGENT_ID, MIN_AGENT_ID
 from transport.messages.half_floats import half_up
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
+from transport.messages.uwb_body import MAX_TAGS
 
 Triple = tuple[float, float, float]
 NO_BOUND: Triple = (math.inf, math.inf, math.inf)
@@ -37,6 +38,8 @@ MAX_POSITION_M = 1e6
 MAX_SPEED_MPS = 1e4
 MAX_RANGE_M = 1e5
 MAX_ACCEL_MPS2 = 1e4
+MAX_TURN = 64.0
+"""Of a rotation vector's components in rad and of turn rates in rad/s."""
 RECORDS_KNOWN_AGAIN = 4096
 """How many decoded records are known again by their bytes: more than a fleet of ten sends anew in its history."""
 BODIES_KNOWN_AGAIN = 128
@@ -52,6 +55,9 @@ class MeasurementKind(IntEnum):
     RANGE = 4
     ANCHOR_RANGE = 5
     ACCELERATION = 6
+    ORIENTATION = 7
+    TAG_RANGE = 8
+    ANTENNA_SPEED = 9
 
 
 _Floats = tuple[float, ...]
@@ -166,6 +172,35 @@ class RangeMeasurement(_Record):
 
 
 @dataclass(frozen=True)
+class TagRangeMeasurement(RangeMeasurement):
+    """The same between antennas that are not the first ones of their drones: their indices, 0..15."""
+
+    kind = MeasurementKind.TAG_RANGE
+
+    tag: int = 0
+    other_tag: int = 0
+
+    def parts(self) -> _Parts:
+        tags = self.tag * MAX_TAGS + self.other_tag
+        return _Parts(
+            (self.offset_s, self.other, tags), (self.range_m,), (self.variance_m2,), (self.half_width_m,)
+        )
+
+
+@dataclass(frozen=True)
+class AntennaSpeedMeasurement(SpeedMeasurement):
+    """The norm of the velocity of ``observer``'s GPS antenna, which moves against it with ``shift_mps`` NED."""
+
+    kind = MeasurementKind.ANTENNA_SPEED
+
+    shift_mps: Triple = (0.0, 0.0, 0.0)
+
+    def parts(self) -> _Parts:
+        values = (self.speed_mps, *self.shift_mps)
+        return _Parts((self.offset_s,), values, (self.variance_m2ps2,), (self.half_width_mps,))
+
+
+@dataclass(frozen=True)
 class AnchorRangeMeasurement(_Record):
     """The range from ``observer`` to a fixed anchor at ``anchor_m`` (NED m) as measured, m."""
 
@@ -196,6 +231,23 @@ class AccelerationMeasurement(_Record):
         return _Parts((), self.accel_mps2, self.variance_m2ps4, ())
 
 
+@dataclass(frozen=True)
+class OrientationMeasurement(_Record):
+    """How ``observer`` lies at the start of ``tick``: what turns its antennas' lever arms; no part of the state.
+
+    ``rotation_rad`` is the rotation vector that turns body FRD into NED, ``rate_radps`` the turn rate, NED.
+    """
+
+    kind = MeasurementKind.ORIENTATION
+    limit = MAX_TURN
+
+    rotation_rad: Triple
+    rate_radps: Triple
+
+    def parts(self) -> _Parts:
+        return _Parts((), (*self.rotation_rad, *self.rate_radps), (), ())
+
+
 Measurement = (
     PositionMeasurement
     | VelocityMeasurement
@@ -203,6 +255,7 @@ Measurement = (
     | RangeMeasurement
     | AnchorRangeMeasurement
     | AccelerationMeasurement
+    | OrientationMeasurement
 )
 
 _LAYOUT: dict[int, struct.Struct] = {
@@ -212,6 +265,9 @@ _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.RANGE: struct.Struct("<BHBfHfee"),
     MeasurementKind.ANCHOR_RANGE: struct.Struct("<BHBf3ffee"),
     MeasurementKind.ACCELERATION: struct.Struct("<BHB3f3e"),
+    MeasurementKind.ORIENTATION: struct.Struct("<BHB3e3e"),
+    MeasurementKind.TAG_RANGE: struct.Struct("<BHBfHBfee"),
+    MeasurementKind.ANTENNA_SPEED: struct.Struct("<BHBff3eee"),
 }
 _AGE_AT = 3
 """Where the age stands in a record."""
@@ -344,6 +400,9 @@ def _check_ids(record: _Record) -> None:
     good = MIN_AGENT_ID <= record.observer <= MAX_AGENT_ID
     if isinstance(record, RangeMeasurement):
         good = good and MIN_AGENT_ID <= record.other <= MAX_AGENT_ID and record.other != record.observer
+    tags = (record.tag, record.other_tag) if isinstance(record, TagRangeMeasurement) else ()
+    if not all(0 <= tag < MAX_TAGS for tag in tags):
+        raise EncodeError(f"{record}: expected tags from 0 to {MAX_TAGS - 1}")
     if not good:
         raise EncodeError(f"{record}: expected distinct agent ids from {MIN_AGENT_ID} to {MAX_AGENT_ID}")
 
@@ -375,6 +434,9 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
     if kind == MeasurementKind.ACCELERATION:
         accel = _bounded(fields[3:6], MAX_ACCEL_MPS2, "acceleration")
         return AccelerationMeasurement(observer, tick, _triple(accel), _triple(_variances(fields[6:9])))
+    if kind == MeasurementKind.ORIENTATION:
+        turns = _bounded(fields[3:9], MAX_TURN, "orientation")
+        return OrientationMeasurement(observer, tick, _triple(turns), _triple(turns[3:]))
     offset = _bounded(fields[3:4], MAX_OFFSET_S, "offset")[0]
     if kind == MeasurementKind.POSITION:
         position = _triple(_bounded(fields[4:7], MAX_POSITION_M, "position"))
@@ -388,12 +450,18 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
     if kind == MeasurementKind.SPEED:
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]
         return SpeedMeasurement(observer, tick, speed, sigma, half_width, offset)
-    if kind == MeasurementKind.RANGE:
+    if kind == MeasurementKind.ANTENNA_SPEED:
+        values = _bounded(fields[4:8], MAX_SPEED_MPS, "speed")
+        return AntennaSpeedMeasurement(observer, tick, values[0], sigma, half_width, offset, _triple(values[1:]))
+    if kind in (MeasurementKind.RANGE, MeasurementKind.TAG_RANGE):
         other = int(fields[4])
         if other == observer:
             raise Rejected(Reason.OUT_OF_RANGE, f"range of agent {observer} to itself")
-        range_m = _bounded(fields[5:6], MAX_RANGE_M, "range")[0]
-        return RangeMeasurement(observer, tick, other, range_m, sigma, half_width, offset)
+        range_m = _bounded(fields[-3:-2], MAX_RANGE_M, "range")[0]
+        if kind == MeasurementKind.RANGE:
+            return RangeMeasurement(observer, tick, other, range_m, sigma, half_width, offset)
+        tags = divmod(int(fields[5]), MAX_TAGS)
+        return TagRangeMeasurement(observer, tick, other, range_m, sigma, half_width, offset, *tags)
     anchor = _triple(_bounded(fields[4:7], MAX_POSITION_M, "anchor"))
     range_m = _bounded(fields[7:8], MAX_RANGE_M, "range")[0]
     return AnchorRangeMeasurement(observer, tick, anchor, range_m, sigma, half_width, offset)

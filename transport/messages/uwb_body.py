@@ -25,7 +25,9 @@ MAX_OFFSET_S = 1.0
 
 _MAGIC = b"UWB1"
 _HEADER = struct.Struct("<4sBBHIQ")
-_RECORD = struct.Struct("<HfHbbBx")
+_RECORD = struct.Struct("<HfHbbBB")
+MAX_TAGS = 16
+"""Antennas of a module on one drone."""
 _FLAG_UNIX = 0b1
 _NOT_GIVEN_DBM = 127
 """A power of +127 dBm does not occur; it stands for "not given"."""
@@ -38,7 +40,8 @@ class UwbRange:
     """One range: antenna to antenna in m, antenna delays already removed.
 
     ``sigma_m`` 1-sigma (``None``: the driver does not know), ``nlos`` probability 0..1 of no line of sight,
-    ``offset_s`` of this measurement from the frame's time, powers in dBm, ``quality`` 0..1.
+    ``offset_s`` of this measurement from the frame's time, powers in dBm, ``quality`` 0..1. ``tag`` and ``other_tag``
+    0..15 say which of the observer's and of the other's antennas.
     """
 
     other: int
@@ -49,6 +52,8 @@ class UwbRange:
     first_path_dbm: float | None = None
     quality: float | None = None
     offset_s: float = 0.0
+    tag: int = 0
+    other_tag: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +83,8 @@ class _JsonRange(msgspec.Struct):
     nlos: float | None = None
     dt: float = 0.0
     st: str = "ok"
+    tag: int = 0
+    otag: int = 0
 
 
 class _JsonFrame(msgspec.Struct):
@@ -109,7 +116,16 @@ def encode_uwb_json(frame: UwbFrame) -> bytes:
     _check_sendable(frame)
     ranges = [
         _JsonRange(
-            r.other, r.range_m, r.sigma_m, r.quality, r.rx_dbm, r.first_path_dbm, r.nlos, r.offset_s
+            id=r.other,
+            r=r.range_m,
+            s=r.sigma_m,
+            q=r.quality,
+            rx=r.rx_dbm,
+            fp=r.first_path_dbm,
+            nlos=r.nlos,
+            dt=r.offset_s,
+            tag=r.tag,
+            otag=r.other_tag,
         )
         for r in frame.ranges
     ]
@@ -186,7 +202,7 @@ def _decode_json(payload: bytes) -> UwbFrame:
     if not (1 <= frame.obs <= MAX_ID and 0 <= frame.seq < 1 << 63 and 0 <= frame.t < 1 << 63):
         raise Rejected(Reason.OUT_OF_RANGE, f"uwb observer {frame.obs}, seq {frame.seq}, t {frame.t}")
     ranges = [
-        UwbRange(m.id, m.r, m.s, m.nlos, m.rx, m.fp, m.q, m.dt)
+        UwbRange(m.id, m.r, m.s, m.nlos, m.rx, m.fp, m.q, m.dt, m.tag, m.otag)
         for m in frame.m
         if m.st == "ok" and m.r is not None
     ]
@@ -206,9 +222,11 @@ def _decode_binary(payload: bytes) -> UwbFrame:
     if t_ns >= 1 << 63:
         raise Rejected(Reason.OUT_OF_RANGE, f"uwb time {t_ns} ns")
     ranges = []
-    for other, range_m, sigma_mm, rx, fp, nlos in _RECORD.iter_unpack(payload[_HEADER.size :]):
+    for other, range_m, sigma_mm, rx, fp, nlos, tags in _RECORD.iter_unpack(payload[_HEADER.size :]):
         sigma_m = sigma_mm * 1e-3 if sigma_mm else None
-        ranges.append(UwbRange(other, range_m, sigma_m, nlos / 255, _power(rx), _power(fp)))
+        tag, other_tag = divmod(tags, MAX_TAGS)
+        powers = _power(rx), _power(fp)
+        ranges.append(UwbRange(other, range_m, sigma_m, nlos / 255, *powers, tag=tag, other_tag=other_tag))
     return _frame(seq, "unix" if flags & _FLAG_UNIX else "mono", t_ns, ranges, None, count)
 
 
@@ -230,6 +248,7 @@ def _usable(r: UwbRange) -> bool:
     return (
         1 <= r.other <= MAX_ID and 0 < r.range_m <= MAX_RANGE_M and sigma
         and powers and shares and abs(r.offset_s) <= MAX_OFFSET_S
+        and 0 <= r.tag < MAX_TAGS and 0 <= r.other_tag < MAX_TAGS
     )  # fmt: skip
 
 
@@ -244,4 +263,5 @@ def _check_sendable(frame: UwbFrame) -> None:
 def _pack_range(r: UwbRange) -> bytes:
     sigma_mm = 0 if r.sigma_m is None else min(max(math.ceil(r.sigma_m * 1e3 - 1e-9), 1), 0xFFFF)
     powers = (_NOT_GIVEN_DBM if dbm is None else round(dbm) for dbm in (r.rx_dbm, r.first_path_dbm))
-    return _RECORD.pack(r.other, r.range_m, sigma_mm, *powers, round(255 * (r.nlos or 0.0)))
+    tags = r.tag * MAX_TAGS + r.other_tag
+    return _RECORD.pack(r.other, r.range_m, sigma_mm, *powers, round(255 * (r.nlos or 0.0)), tags)

@@ -251,7 +251,10 @@ class AmbiguityMonitor:
                 target = int(row["other"] if row["agent"] == self._slot else row["agent"])
                 if target not in bodies or _sigma(bodies[target][1]) > LOCATED_FRACTION * float(row["value"]):
                     continue
-                body = bodies[target]
+                state, spread = bodies[target]
+                side = -1.0 if row["agent"] == self._slot else 1.0
+                shift = np.array([row["x"], row["y"], row["z"], 0.0, 0.0, 0.0])
+                body = state + side * shift, spread
             yield _Ranged(float(row["value"]), float(row["variance"]), float(row["offset_s"]), target, *body)
 
 

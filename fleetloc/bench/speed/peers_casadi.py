@@ -130,11 +130,12 @@ class WindowNlp:
         at = STATES_PER_AGENT * int(row["agent"])
         if row["kind"] == Kind.POSITION:
             return float(row["x"]) * x[at] + float(row["y"]) * x[at + 1] + float(row["z"]) * x[at + 2]
+        shift = self.casadi.DM([float(row["x"]), float(row["y"]), float(row["z"])])
         if row["kind"] == Kind.SPEED:
-            vector = x[at + 3 : at + 6]
+            vector = x[at + 3 : at + 6] + shift
         else:
             other = STATES_PER_AGENT * int(row["other"])
-            vector = x[at : at + 3] - x[other : other + 3]
+            vector = x[at : at + 3] - x[other : other + 3] + shift
         return self.casadi.sqrt(self.casadi.sumsqr(vector) + self.eps**2)
 
     def advance(self, tick: int, x: Any) -> Any:

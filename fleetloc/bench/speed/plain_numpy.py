@@ -20,7 +20,7 @@ from scipy import sparse
 from estimators.consensus.information import rank_weights
 from estimators.estimator import Payload
 from estimators.model.layout import STATES_PER_AGENT
-from estimators.model.measurements import Kind, Matrix, RowTable, Vector
+from estimators.model.measurements import Kind, Matrix, RowTable, Vector, is_shifted
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.window.problem import WindowProblem
 from fleetloc.bench.speed.bounds import Bounds
@@ -38,8 +38,8 @@ class TickRows:
 
     def __init__(self, rows: RowTable) -> None:
         kinds = set(rows["kind"].tolist())
-        if kinds - {Kind.POSITION, Kind.SPEED, Kind.RANGE} or rows["offset_s"].any():
-            raise ValueError("plain model: expected position, speed and range rows at the tick's instant")
+        if kinds - {Kind.POSITION, Kind.SPEED, Kind.RANGE} or rows["offset_s"].any() or is_shifted(rows):
+            raise ValueError("plain model: expected positions, speeds, ranges at the tick's instant, no lever arms")
         self.value: Vector = rows["value"].copy()
         self.precision: Vector = 1.0 / rows["variance"]
         self.half_width: Vector = rows["half_width"].copy()

@@ -9,6 +9,8 @@ target       node2, to                                           id of the other
 range_m      uwb_range, range                                    m
 sigma_m      sigma                                               1-sigma in m; absent = the configured one
 true_m       mocap_range, truth                                  true distance in m, for `fleetloc ranges`
+tag          observer_tag                                        antenna of the observer, 0..15; absent = 0
+other_tag    target_tag                                          antenna of the other, likewise
 ===========  ==================================================  =======================================
 
 A line that cannot be used is counted by reason with the numbers of the first such lines; it stops nothing.
@@ -30,7 +32,7 @@ from typing import Any
 from sim_bridge.replay.errors import ReplayError
 from sim_bridge.replay.side_files.text_lines import text_lines
 from transport.errors import Rejected
-from transport.messages.uwb_body import MAX_RANGE_M, UwbFrame, decode_uwb
+from transport.messages.uwb_body import MAX_RANGE_M, MAX_TAGS, UwbFrame, decode_uwb
 
 NAMES: Mapping[str, tuple[str, ...]] = {
     "time": ("time", "time_s", "time_unix_s", "timestamp"),
@@ -39,6 +41,8 @@ NAMES: Mapping[str, tuple[str, ...]] = {
     "range_m": ("range_m", "uwb_range", "range"),
     "sigma_m": ("sigma_m", "sigma"),
     "true_m": ("true_m", "mocap_range", "truth"),
+    "tag": ("tag", "observer_tag"),
+    "other_tag": ("other_tag", "target_tag", "otag"),
 }
 REQUIRED = ("time", "observer", "target", "range_m")
 _EXPECTED = f"a header line with the columns {', '.join(REQUIRED)}, or JSON lines"
@@ -63,6 +67,8 @@ class RangeLine:
     range_m: float
     sigma_m: float | None
     true_m: float | None = None
+    tag: int = 0
+    other_tag: int = 0
 
 
 @dataclass(slots=True)
@@ -173,7 +179,15 @@ def frame_lines(frame: UwbFrame) -> list[RangeLine]:
 def ranges_at(frame: UwbFrame, observer: int, time_s: float) -> list[RangeLine]:
     """The ranges of a frame whose observer and time (Unix s) are known."""
     return [
-        RangeLine(time_s + entry.offset_s, observer, entry.other, entry.range_m, entry.sigma_m)
+        RangeLine(
+            time_s + entry.offset_s,
+            observer,
+            entry.other,
+            entry.range_m,
+            entry.sigma_m,
+            tag=entry.tag,
+            other_tag=entry.other_tag,
+        )
         for entry in frame.ranges
     ]
 
@@ -203,7 +217,8 @@ def _line(values: Mapping[str, Any]) -> RangeLine:
                        for name in ("sigma_m", "true_m"))  # fmt: skip
     if sigma_m is not None and sigma_m <= 0.0:
         raise ValueError("sigma_m not positive")
-    return RangeLine(time_s, observer, target, range_m, sigma_m, true_m)
+    tags = _tag(values, "tag"), _tag(values, "other_tag")
+    return RangeLine(time_s, observer, target, range_m, sigma_m, true_m, *tags)
 
 
 def _number(values: Mapping[str, Any], name: str) -> float:
@@ -220,6 +235,15 @@ def _id(values: Mapping[str, Any], name: str) -> int:
     value = _number(values, name)
     if value != int(value) or not 1 <= value <= 0xFFFF:
         raise ValueError(f"{name} no id")
+    return int(value)
+
+
+def _tag(values: Mapping[str, Any], name: str) -> int:
+    if values.get(name) in (None, ""):
+        return 0
+    value = _number(values, name)
+    if value != int(value) or not 0 <= value < MAX_TAGS:
+        raise ValueError(f"{name} no antenna")
     return int(value)
 
 

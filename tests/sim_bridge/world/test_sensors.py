@@ -11,7 +11,7 @@ from agent.sensing.frames import FleetFrame
 from sim_bridge.faults.fault_tables import GpsWrong
 from sim_bridge.world import quaternions
 from sim_bridge.world.guidance import Waypoints
-from sim_bridge.world.noise import PAPER, REALISTIC, GaussMarkov
+from sim_bridge.world.noise import PAPER, REALISTIC, GaussMarkov, GpsNoise, UwbNoise
 from sim_bridge.world.scenario import Interval, Vehicle
 from sim_bridge.world.simulation import Simulation
 
@@ -208,3 +208,38 @@ def test_pairs_are_biased_within_what_calibration_leaves_or_as_delivered(make_sc
         assert bias.size == 30 * 29 // 2
         assert bias.mean() == pytest.approx(mean, abs=0.03)
         assert bias.std() == pytest.approx(sigma, rel=0.15)
+
+
+def test_antennas_are_where_the_attitude_turns_their_arms(make_scenario):
+    # GIVEN a turning drone with antennas off its IMU, another with two tags, and sensors without noise
+    arm, tags = (0.3, -0.1, 0.2), ((0.0, 0.3, 0.0), (0.2, 0.0, -0.1))
+    vehicles = Vehicle(1, gps_antenna_m=arm, uwb_tags_m=(arm,)), Vehicle(2, system_id=2, uwb_tags_m=tags)
+    simulation = Simulation(make_scenario(*vehicles, yaw_rate_radps=0.5, gps_speed="norm"), 0.0)
+    simulation.sensors._gps_noise = GpsNoise()
+    simulation.sensors._receivers[0]._noise = GpsNoise()
+    simulation.sensors._channel._noise = UwbNoise()
+    seen, before = [], None
+    for world in each_step(simulation, 2.0):
+        turned = quaternions.rotate(world.attitude(), np.array([arm, arm]))[0]
+        antenna = world.position_m[0] + turned
+        for slot, fix in simulation.sensors.fixes():
+            if slot == 0:
+                # THEN a fix is one of the antenna, and its speed the antenna's
+                np.testing.assert_allclose(ned_of(simulation.scenario.frame, fix), antenna, atol=1e-6)
+                if before is not None:
+                    speed_mps = np.linalg.norm(antenna - before) / world.step_s
+                    assert fix.speed_mps == pytest.approx(speed_mps, abs=0.02)
+        for taken in simulation.sensors.ranges():
+            for measured in taken.ranges:
+                # AND a range is one between the antennas that it names, which take turns
+                own, other = (measured.tag, measured.other_tag) if taken.observer == 1 else (
+                    measured.other_tag, measured.tag
+                )  # fmt: skip
+                assert own == 0
+                seen.append(other)
+                there = world.position_m[1] + quaternions.rotate(world.attitude()[1:], np.array([tags[other]]))[0]
+                assert measured.range_m == pytest.approx(np.linalg.norm(there - antenna), abs=1e-9)
+        before = antenna
+    assert set(seen) == {0, 1}
+    yaw = [float(world_yaw) for world_yaw in simulation.world.yaw_rad]
+    assert yaw == pytest.approx([1.0, 1.0])

@@ -16,12 +16,15 @@ from transport.messages.measurement_body import (
     RECORD_BYTES,
     AccelerationMeasurement,
     AnchorRangeMeasurement,
+    AntennaSpeedMeasurement,
     Measurement,
     MeasurementKind,
     Measurements,
+    OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
     SpeedMeasurement,
+    TagRangeMeasurement,
     VelocityMeasurement,
     as_sent,
     decode_measurements,
@@ -61,7 +64,17 @@ anchors = st.builds(
     AnchorRangeMeasurement, ids, ticks, triples(numbers(1e6)), numbers(1e5), variances, widths, offsets
 )
 accelerations = st.builds(AccelerationMeasurement, ids, ticks, triples(numbers(1e4)), triples(variances))
-records = st.one_of(positions, velocities, speeds, ranges, anchors, accelerations)
+tags = st.integers(0, 15)
+tag_ranges = st.builds(
+    TagRangeMeasurement, ids, ticks, ids, numbers(1e5), variances, widths, offsets, tags, tags
+).filter(lambda record: record.observer != record.other)
+antenna_speeds = st.builds(
+    AntennaSpeedMeasurement, ids, ticks, numbers(1e4), variances, widths, offsets, triples(numbers(60.0))
+)
+orientations = st.builds(OrientationMeasurement, ids, ticks, triples(numbers(3.2)), triples(numbers(60.0)))
+records = st.one_of(
+    positions, velocities, speeds, ranges, anchors, accelerations, tag_ranges, antenna_speeds, orientations
+)
 
 RANGE = RangeMeasurement(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
 SPEED = SpeedMeasurement(1, TICK, 1.5, 0.04)
@@ -86,7 +99,7 @@ def test_a_record_comes_back_close_and_never_more_trusted(record: Measurement) -
     assert type(received) is type(record)
     for field in fields(record):
         sent, came = getattr(record, field.name), getattr(received, field.name)
-        if field.name in ("observer", "other", "tick"):
+        if field.name in ("observer", "other", "tick", "tag", "other_tag"):
             assert sent == came
         elif field.name.startswith("variance"):
             for a, b in zip(flat(sent), flat(came), strict=True):
@@ -95,6 +108,9 @@ def test_a_record_comes_back_close_and_never_more_trusted(record: Measurement) -
             for a, b in zip(flat(sent), flat(came), strict=True):
                 assert b >= a
                 assert b <= a * 1.001 + 6e-8 or a > 65504
+        elif field.name in ("shift_mps", "rotation_rad", "rate_radps"):  # float16 will do: they turn short arms
+            for a, b in zip(flat(sent), flat(came), strict=True):
+                assert b == pytest.approx(a, rel=5e-4, abs=3e-8)
         else:
             for a, b in zip(flat(sent), flat(came), strict=True):
                 assert b == pytest.approx(a, rel=1e-7, abs=1e-37)
@@ -114,6 +130,8 @@ IDENTITY_ENDS = dict.fromkeys(MeasurementKind, 8) | {
     MeasurementKind.RANGE: 10,
     MeasurementKind.ANCHOR_RANGE: 20,
     MeasurementKind.ACCELERATION: 4,
+    MeasurementKind.ORIENTATION: 4,
+    MeasurementKind.TAG_RANGE: 11,
 }
 """Byte of a record at which its values begin: up to there it says which measurement it is."""
 
@@ -223,6 +241,11 @@ def test_what_says_nothing_or_is_too_old_is_left_out_and_counted() -> None:
         replace(SPEED, observer=1000),
         replace(RANGE, other=1),
         replace(RANGE, other=1000),
+        TagRangeMeasurement(1, TICK, 2, 10.0, 0.01, tag=16),
+        TagRangeMeasurement(1, TICK, 2, 10.0, 0.01, other_tag=-1),
+        OrientationMeasurement(1, TICK, (65.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
+        OrientationMeasurement(1, TICK, (0.0, 0.0, 0.0), (math.nan, 0.0, 0.0)),
+        AntennaSpeedMeasurement(1, TICK, 1.0, 0.1, shift_mps=(math.inf, 0.0, 0.0)),
         AnchorRangeMeasurement(1, TICK, (math.nan, 0.0, 0.0), 1.0, 1.0),
         PositionMeasurement(1, TICK, (0.0, 0.0, 2e6), (1.0, 1.0, 1.0)),
     ],
@@ -253,7 +276,12 @@ RANGE_WIRE = "<BHBfHfee"
         (struct.pack(RANGE_WIRE, 4, 1, 0, 0, 4, 1, 1, 1), 1, Reason.UNKNOWN_AGENT),
         (struct.pack(RANGE_WIRE, 4, 1, 0, 0, 1, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
         (struct.pack(SPEED_WIRE, 3, 1, 200, 0, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
-        (struct.pack(SPEED_WIRE, 7, 1, 0, 0, 1, 1, 1), 1, Reason.MALFORMED),
+        (struct.pack(SPEED_WIRE, 10, 1, 0, 0, 1, 1, 1), 1, Reason.MALFORMED),
+        (struct.pack("<BHB6e", 7, 1, 0, math.nan, 0, 0, 0, 0, 0), 1, Reason.NOT_FINITE),
+        (struct.pack("<BHB6e", 7, 1, 0, 0, 0, 0, 0, 0, 65), 1, Reason.OUT_OF_RANGE),
+        (struct.pack("<BHBfHBfee", 8, 1, 0, 0, 1, 0, 1, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack("<BHBfHBfee", 8, 1, 0, 0, 4, 0, 1, 1, 1), 1, Reason.UNKNOWN_AGENT),
+        (struct.pack("<BHBff3eee", 9, 1, 0, 0, 1, math.inf, 0, 0, 1, 1), 1, Reason.NOT_FINITE),
         (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1)[:-1], 1, Reason.MALFORMED),
         (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1), 2, Reason.MALFORMED),
         (struct.pack(SPEED_WIRE, 3, 1, 0, 0, 1, 1, 1), 0, Reason.MALFORMED),

@@ -32,6 +32,8 @@ some_range = st.builds(
     first_path_dbm=st.one_of(st.none(), st.integers(-120, 0).map(float)),
     quality=st.one_of(st.none(), share),
     offset_s=st.floats(-1, 1),
+    tag=st.integers(0, 15),
+    other_tag=st.integers(0, 15),
 )
 frames = st.builds(
     UwbFrame,
@@ -62,6 +64,7 @@ def test_the_binary_form_keeps_what_it_has_room_for(frame: UwbFrame) -> None:
     assert (came.seq, came.clock, came.t_ns, came.skipped) == (sent.seq, "unix", sent.t_ns, 0)
     for a, b in zip(sent.ranges, came.ranges, strict=True):
         assert (b.other, b.rx_dbm, b.first_path_dbm) == (a.other, a.rx_dbm, a.first_path_dbm)
+        assert (b.tag, b.other_tag) == (a.tag, a.other_tag)
         assert b.range_m == pytest.approx(a.range_m, rel=1e-7)
         assert b.nlos == pytest.approx(a.nlos or 0.0, abs=1 / 509)
         assert (b.sigma_m is None) == (a.sigma_m is None)

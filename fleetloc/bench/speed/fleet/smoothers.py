@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from estimators.model.layout import position, velocity
-from estimators.model.measurements import InputTable, Kind, RowTable, Vector
+from estimators.model.measurements import InputTable, Kind, RowTable, Vector, is_shifted
 from fleetloc.bench.speed.fleet.flight import FleetFlight
 
 INTEGRAL_SIGMA_M = 1e-4
@@ -116,8 +116,8 @@ class GraphMaker:
         return gtsam.LinearContainerFactor(gtsam.JacobianFactor(rest.at(0)), zero)
 
     def _add_rows(self, factors: Any, tick: int, rows: RowTable) -> None:
-        if rows["offset_s"].any():
-            raise ValueError("gtsam: expected rows at the tick's instant")
+        if rows["offset_s"].any() or is_shifted(rows):
+            raise ValueError("gtsam: expected rows at the tick's instant, without lever arms")
         keys: dict[int, Callable[[int, int], int]] = {
             Kind.POSITION: self.position_key,
             Kind.VELOCITY: self.velocity_key,

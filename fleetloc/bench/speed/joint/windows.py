@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.model.layout import STATES_PER_AGENT, Layout
-from estimators.model.measurements import Kind, Matrix, RowTable, Vector
+from estimators.model.measurements import Kind, Matrix, RowTable, Vector, is_shifted
 from estimators.model.motion import predict_mean
 from estimators.settings import EstimatorSettings
 from estimators.window.assembly import open_window, window_problem
@@ -87,8 +87,8 @@ def staged(problem: WindowProblem, edges: Edges) -> StagedWindow:
 
 def _places(rows: RowTable, dimension: int, edges: Edges) -> NDArray[np.int64]:
     """Where each row stands in its stage."""
-    if rows["offset_s"].any():
-        raise ValueError("staged windows: expected rows at the tick's instant")
+    if rows["offset_s"].any() or is_shifted(rows):
+        raise ValueError("staged windows: expected rows at the tick's instant, without lever arms")
     place = {edge: dimension + index for index, edge in enumerate(edges)}
     found = []
     for row in rows:

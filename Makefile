@@ -48,13 +48,16 @@ $(INSTALLED): requirements.lock pyproject.toml
 	@$(BIN)/python -m pip install $(PIP_OPTIONS) --no-deps --editable .
 	@touch $@
 
+# Python 3.14 has compilers of its own (pyproject.toml); the lines for it are kept as they are written in the lock
 lock:
 	$(PYTHON) -c '$(IS_NEW_ENOUGH)'
 	rm -rf build/lock
 	$(PYTHON) -m venv build/lock
 	build/lock/bin/python -m pip install $(PIP_OPTIONS) '.[dev,$(EXTRAS)]'
 	{ echo "# Every package of a working environment, pinned; made by make lock."; \
-	  build/lock/bin/python -m pip freeze --all --exclude fleetloc --exclude pip; } > build/requirements.lock
+	  build/lock/bin/python -m pip freeze --all --exclude fleetloc --exclude pip \
+	    | sed -E 's/^(llvmlite|numba|numpy)==.*/& ; python_version < "3.14"/'; \
+	  grep '>= "3.14"$$' requirements.lock; } | sort -f > build/requirements.lock
 	mv build/requirements.lock requirements.lock
 	rm -rf build/lock
 

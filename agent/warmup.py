@@ -7,7 +7,7 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from agent.core import ESTIMATOR_FAULTS, EstimatorFactory
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
-from estimators.model.measurements import RowTable, input_rows, position_rows, range_row, speed_row
+from estimators.model.measurements import RowTable, Vector, input_rows, position_rows, range_row, speed_row
 
 TICKS = 3
 SPACING_M = 10.0
@@ -37,7 +37,7 @@ def warm_up(config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory
         return
 
 
-def _rows(tick: int, layout: Layout, mean: np.ndarray) -> RowTable:
+def _rows(tick: int, layout: Layout, mean: Vector) -> RowTable:
     """Fixes and speeds of all agents and the ranges between neighbours in the order of the layout."""
     tables = []
     for slot in range(layout.size):

@@ -120,12 +120,12 @@ def dotted(path: Path) -> str:
 
 
 def lock_faults(lock: str, needed: set[str]) -> Iterator[str]:
-    """Lines of a lock file that are no plain pin, and needed packages without one."""
+    """Lines of a lock file that are no pin, for all versions of Python or for some, and needed packages without one."""
     pinned = set()
     for line in lock.splitlines():
         if line.startswith("#") or not line:
             continue
-        if match := re.fullmatch(r"([A-Za-z0-9._-]+)==[\w.+!]+", line):
+        if match := re.fullmatch(r"([A-Za-z0-9._-]+)==[\w.+!]+( ; python_version [<>=]+ \"[\d.]+\")?", line):
             pinned.add(normalised(match[1]))
         else:
             yield f"not name==version: {line}"

@@ -36,7 +36,8 @@ class Motions:
         told is zero with a variance that grows with the time for which none was told.
         """
         moved, wandered = np.zeros((MEMORY_TICKS + 1, 3)), np.zeros(MEMORY_TICKS + 1)
-        period_s, velocity = self._period_s, np.zeros(3)
+        period_s = self._period_s
+        velocity: Vector = np.zeros(3)
         cross, speed_variance = 0.0, 0.0
         known, unseen = self._known.get(agent_id, {}), 0
         for back in range(1, MEMORY_TICKS + 1):

@@ -23,6 +23,7 @@ from mcap.writer import Writer
 from agent.errors import LogFileError
 from agent.outputs import EstimateReady
 from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.measurements import Vector
 from transport.messages.estimate_body import MAX_AGE_TICKS
 
 SUFFIX = ".mcap"
@@ -68,7 +69,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     agents: dict[str, AgentEstimate]
     inputs: int | None = None
 
-    def arrays(self) -> tuple[np.ndarray, np.ndarray]:
+    def arrays(self) -> tuple[Vector, Vector]:
         """Mean and 1-sigma ``(6n,)`` in NED m and m/s, in the order of the file."""
         seen = self.agents.values()
         mean = [_triple(vector) for a in seen for vector in (a.position_m, a.velocity_mps)]

@@ -173,8 +173,8 @@ class LatencyEstimator:
         if not (math.isfinite(prior_s) and math.isfinite(prior_sigma_s) and prior_sigma_s > 0.0):
             raise ValueError(f"latency: expected a finite prior and a positive sigma, got {prior_s}, {prior_sigma_s}")
         self._model = model or LatencyModel()
-        offsets = np.linspace(-GRID_SIGMAS, GRID_SIGMAS, GRID_POINTS)
-        fine = np.linspace(-GRID_SIGMAS, GRID_SIGMAS, FINE_POINTS)
+        offsets = np.linspace(-GRID_SIGMAS, GRID_SIGMAS, GRID_POINTS, dtype=np.float64)
+        fine = np.linspace(-GRID_SIGMAS, GRID_SIGMAS, FINE_POINTS, dtype=np.float64)
         self.grid_s: Vector = prior_s + prior_sigma_s * offsets
         self._fine_s: Vector = prior_s + prior_sigma_s * fine
         self._log_prior: Vector = -0.5 * offsets**2

@@ -233,7 +233,7 @@ def inherit(
 
 @entry("boolean(float64[:, ::1], float64[:, ::1], float64, boolean[::1])")
 def _find_better(
-    own: Matrix, other: Matrix, threshold: float, better: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    own: Matrix, other: Matrix, threshold: float, better: NDArray[np.bool_]
 ) -> bool:
     """Which agents' marginals the other information matrix knows better; False where one is not positive definite."""
     n = own.shape[0]
@@ -268,7 +268,7 @@ def _transplant(
     own: Pair,
     other: Pair,
     covariance: Matrix,
-    taken: np.ndarray[tuple[int], np.dtype[np.bool_]],
+    taken: NDArray[np.bool_],
 ) -> Pair:
     """Own marginal of the states not ``taken`` times the other's conditional of those taken."""
     kept = ~taken

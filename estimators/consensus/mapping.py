@@ -32,9 +32,8 @@ def mapped_pair(
     kept, others, at = _places(tuple(sender), tuple(receiver))
     reduced, right = marginal_of_states(pair, kept, others)
     dimension = STATES_PER_AGENT * len(receiver)
-    information, vector = flat * np.eye(dimension), np.zeros(dimension)
-    if centre is not None:
-        vector = flat * centre
+    information = flat * np.eye(dimension)
+    vector: Vector = np.zeros(dimension) if centre is None else flat * centre
     information[np.ix_(at, at)], vector[at] = reduced, right
     return information, vector
 

@@ -134,7 +134,7 @@ class InnovationMonitor:
         """``(n,)``: whose fixes contradict the rest."""
         self.ignored = Ignored(np.zeros(agents, np.bool_), np.zeros((agents, agents), np.bool_))
         """What is to get no weight."""
-        self._ignored_s = np.zeros(agents)
+        self._ignored_s: Vector = np.zeros(agents)
         self._unfixed_s = np.full(agents, np.inf)
         """``(n,)``: since the last fix."""
 

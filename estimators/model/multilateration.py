@@ -141,7 +141,7 @@ def _descend(states: Matrix, ranges: RangeSet, speed_sigma_mps: float) -> tuple[
     """Levenberg-Marquardt from all starts ``(s, 6)`` at once; where they end and at which cost ``(s,)``."""
     prior = np.diag([_WEAK] * 3 + [1.0 / speed_sigma_mps**2] * 3)
     states, costs = states.copy(), _cost(states, ranges, speed_sigma_mps)
-    damping = np.full(len(states), 1e-3)
+    damping: Vector = np.full(len(states), 1e-3)
     for _ in range(ITERATIONS):
         residuals, jacobian = _residuals(states, ranges)
         hessian = np.einsum("smi,smj->sij", jacobian, jacobian) + prior

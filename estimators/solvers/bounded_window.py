@@ -12,6 +12,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.compiled.entries import plain
 from estimators.model.layout import STATES_PER_AGENT
@@ -145,7 +146,8 @@ class _BoundedSqp:
         path, slow, variances, curved = self.path, self.slow, np.empty(self.rows), False
         trial_variances = np.empty(self.rows)
         cost = joint_objective(self.window, self.prior, path, slow, variances)
-        values, multipliers = self.values(path, slow), np.zeros(len(self.low))
+        values = self.values(path, slow)
+        multipliers: Vector = np.zeros(len(self.low))
         last, iterations, converged = EXPECTED_CONTRACTION_M, 0, False
         while iterations < max_iterations and not converged:
             direction = self._program(path, slow, variances, values, multipliers, curved)
@@ -236,11 +238,12 @@ class _BoundedSqp:
         """The quadratic model about a path: its unbounded step, and how the chosen quantities respond to pulls."""
         ticks, d = path.shape
         p, b, q = len(chosen), len(bent.tick), self.variables - d
-        tick, along = np.empty(p, np.int64), np.empty((p, self.variables))
-        quantity_gradients(self.window, path, chosen, tick, along)
-        tick, along = np.concatenate([tick, bent.tick]), np.concatenate([along, bent.along])
+        of_chosen, gradients = np.empty(p, np.int64), np.empty((p, self.variables))
+        quantity_gradients(self.window, path, chosen, of_chosen, gradients)
+        tick, along = np.concatenate([of_chosen, bent.tick]), np.concatenate([gradients, bent.along])
         trial, there = np.empty((ticks, d)), np.empty(q)
-        responses, slow_responses = np.empty((p + b, ticks, d)), np.empty((p + b, q))
+        responses: NDArray[np.float64] = np.empty((p + b, ticks, d))
+        slow_responses = np.empty((p + b, q))
         if not newton_responses(
             self.window, self.prior, path, slow, variances, tick, along, trial, there, responses, slow_responses
         ):

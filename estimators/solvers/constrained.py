@@ -155,7 +155,8 @@ class _Sqp:
 
     def run(self, start: Vector, limit: int) -> _Outcome | None:
         """Iterate from ``start``; None where a program has no solution."""
-        z, multipliers = start.copy(), np.zeros(len(self.bound))
+        z: Vector = start.copy()
+        multipliers: Vector = np.zeros(len(self.bound))
         f, values = self.values(z)
         last, iterations, converged = np.inf, 0, False
         while iterations < limit and not converged:

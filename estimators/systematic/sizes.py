@@ -42,7 +42,7 @@ class SystematicSizes:
         self._share = period_s / MEMORY_S
         self._wanders = ReceiverWanders(agents, period_s)
         self._pair_m = PAIR_M[0]
-        self._accel_mps2 = np.full(agents, ACCEL_MPS2[0])
+        self._accel_mps2: Vector = np.full(agents, ACCEL_MPS2[0])
         self._lost_ticks = np.zeros(agents, np.int64)
         """Since the last fix that left the window."""
         self._most_ticks = round(LOST_S / period_s)

@@ -290,9 +290,9 @@ class FleetSensors:
         """Ranges taken so far, by the slots of observer and target: antennas take turns."""
         self._faults = SensorFaults(scenario.faults, scenario.seed)
         self._body_step = -1
-        self._body_force = np.zeros((count, 3))
-        self._body_rates = np.zeros((count, 3))
-        self._body_field = np.zeros((count, 3))
+        self._body_force: Array = np.zeros((count, 3))
+        self._body_rates: Array = np.zeros((count, 3))
+        self._body_field: Array = np.zeros((count, 3))
 
     @property
     def pair_bias_m(self) -> dict[frozenset[int], float]:

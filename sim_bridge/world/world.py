@@ -64,7 +64,7 @@ class FleetWorld:
         self.dynamics = dynamics or Dynamics()
         self.position_m = np.array(position_m, float)
         self.velocity_mps = np.array(velocity_mps, float)
-        self.accel_mps2 = np.zeros((count, 3))
+        self.accel_mps2: Array = np.zeros((count, 3))
         self.yaw_rad = np.zeros(count) if yaw_rad is None else np.array(yaw_rad, float)
         self._yaw_step_rad = yaw_rate_radps / STEP_RATE_HZ
         self.landed = np.zeros(count, bool) if on_ground is None else np.array(on_ground, bool)
@@ -77,7 +77,7 @@ class FleetWorld:
         self._gain = lqr_gain(self.dynamics.guidance_steps * self.step_s)
         lag_s = self.dynamics.accel_lag_s
         self._follow = 1.0 if lag_s == 0.0 else -math.expm1(-self.step_s / lag_s)
-        self._command_mps2 = np.zeros((count, 3))
+        self._command_mps2: Array = np.zeros((count, 3))
         self._accel_before_mps2 = self.accel_mps2
         self._attitudes = self._both_attitudes()
         self._attitudes_step = 0

@@ -246,7 +246,7 @@ class AmbiguityMonitor:
         for row in rows[between & (rows["value"] > 0.0)]:  # noise may push a short one below zero
             if row["kind"] == Kind.ANCHOR_RANGE:
                 target = -1
-                body = np.array([row["x"], row["y"], row["z"], 0.0, 0.0, 0.0]), np.zeros((6, 6))
+                body: Body = np.array([row["x"], row["y"], row["z"], 0.0, 0.0, 0.0]), np.zeros((6, 6))
             else:
                 target = int(row["other"] if row["agent"] == self._slot else row["agent"])
                 if target not in bodies or _sigma(bodies[target][1]) > LOCATED_FRACTION * float(row["value"]):

@@ -10,6 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from agent.mavlink.utc_stamps import ROLLOVER_S
+from estimators.model.measurements import Vector
 from sim_bridge.replay.logs.events import UnixZero
 
 GPS_EPOCH_UNIX_S = 315_964_800
@@ -88,7 +89,7 @@ def fitted(pairs: list[tuple[float, float]]) -> tuple[float, float, float] | Non
     return level_s + shift_s - drift * centre_s, drift, spread_s
 
 
-def _median_slope(x: np.ndarray, y: np.ndarray) -> float:
+def _median_slope(x: Vector, y: Vector) -> float:
     """Median of the slopes between points half the data apart (after Theil and Sen)."""
     half = len(x) // 2
     run = x[half:] - x[: len(x) - half]

@@ -120,7 +120,7 @@ def dotted(path: Path) -> str:
 
 
 def lock_faults(lock: str, needed: set[str]) -> Iterator[str]:
-    """Lines of a lock file that are no pin, for all versions of Python or for some, and needed packages without one."""
+    """Lines of a lock file that are no pin, for every Python or for some, and needed packages without one."""
     pinned = set()
     for line in lock.splitlines():
         if line.startswith("#") or not line:

@@ -42,6 +42,7 @@ from estimators.systematic.slow_errors import corrected_rows
 from estimators.window.arrival_cost import first_estimate
 from estimators.window.assembly import open_window
 from estimators.window.limited import solve_limited
+from estimators.window.opening import guess_of_linear_rows, is_open
 from estimators.window.problem import WindowProblem
 from estimators.window.slow_window import (
     SlowProblem,
@@ -256,9 +257,15 @@ class SharedMovingHorizonEstimator:
         guess = continued(path, problem, slow), slow
         limit = settings.max_iterations if budget is None else min(budget, settings.max_iterations)
         bounds = None if self._limits is None else (self._limits, make_engine(settings.qp))
-        return problem, solve_limited(
-            problem, belief, guess, limit, settings.tolerance, bounds, slide=self.window.full
-        )
+
+        def solved(start: tuple[Matrix, Vector]) -> SlowSolution:
+            return solve_limited(
+                problem, belief, start, limit, settings.tolerance, bounds, slide=self.window.full
+            )
+
+        found = solved(guess)
+        other = guess_of_linear_rows(problem, belief, guess, settings.tolerance) if is_open(problem, belief) else None
+        return problem, found if other is None else min(found, solved(other), key=lambda each: each.cost)
 
     def _learn(self, problem: SlowProblem, solution: SlowSolution) -> None:
         """Let the sizes of slow errors follow what leaves the window."""

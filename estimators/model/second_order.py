@@ -1,4 +1,4 @@
-"""What the linearisation of a range misses: the mean square of its second-order term.
+"""What the linearisation of a norm misses, of a range or a speed: the mean square of its second-order term.
 
 A range row is linearised at the estimated places of its two ends. With a relative position error delta of
 covariance D about an estimated distance rho along the unit vector u,
@@ -10,6 +10,9 @@ extended Kalman filter, e.g. Bar-Shalom, Li, Kirubarajan 2001, section 10.3; its
 a place is known well against the distance it vanishes; where it is not, the row says next to nothing about a
 direction, and counting it with the sensor's variance alone makes the estimate overconfident for good, because
 what an arrival cost once holds is never linearised anew.
+
+A speed without a direction is the same with a velocity in place of the way between two ends: a fleet that starts
+slowly, with a velocity that is not known, would be sure of the first one that fits.
 """
 
 from __future__ import annotations
@@ -20,31 +23,30 @@ from estimators.compiled.entries import kernel
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Kind, Matrix, Vector
 
-_RANGE, _ANCHOR_RANGE = int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
+_SPEED, _RANGE, _ANCHOR_RANGE = int(Kind.SPEED), int(Kind.RANGE), int(Kind.ANCHOR_RANGE)
 
 
 @kernel
 def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps: float) -> float:
-    """Mean square in m2 of what a row's linearisation misses, 1/2 tr(TDTD) + 1/4 tr(TD)^2; zero but for ranges.
+    """Mean square in m2 of what a row's linearisation misses, 1/2 tr(TDTD) + 1/4 tr(TD)^2; zero for linear rows.
+
+    In m2/s2 for a speed.
 
     ``state`` ``(6n,)``: where the row is linearised; ``covariance`` ``(6n, 6n)`` of the fleet state; ``eps`` as in
     the rows' smoothed norm, m.
     """
-    if row["kind"] != _RANGE and row["kind"] != _ANCHOR_RANGE:
+    away, spread = np.empty(3), np.empty((3, 3))
+    a = STATES_PER_AGENT * row["agent"]
+    if row["kind"] == _SPEED:
+        for i in range(3):
+            away[i] = state[a + 3 + i]
+            for j in range(3):
+                spread[i, j] = covariance[a + 3 + i, a + 3 + j]
+    elif row["kind"] == _RANGE or row["kind"] == _ANCHOR_RANGE:
+        _between_ends(row, state, covariance, away, spread)
+    else:
         return 0.0
-    away = np.empty(3)
-    spread = np.empty((3, 3))
     bent = np.empty((3, 3))
-    a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
-    b = STATES_PER_AGENT * row["other"]  # negative for anchors
-    anchor = (row["x"], row["y"], row["z"])  # or, between agents, the shift of the one against the other
-    for i in range(3):
-        there = state[b + i] + o * state[b + 3 + i] - anchor[i] if b >= 0 else anchor[i]
-        away[i] = state[a + i] + o * state[a + 3 + i] - there
-        for j in range(3):
-            middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
-            ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
-            spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
     distance = np.sqrt(away[0] * away[0] + away[1] * away[1] + away[2] * away[2] + eps * eps)
     for i in range(3):
         for j in range(3):
@@ -59,6 +61,21 @@ def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps:
         for j in range(3):
             squares += bent[i, j] * bent[j, i]
     return float(0.5 * squares + 0.25 * trace * trace)
+
+
+@kernel
+def _between_ends(row: np.void, state: Vector, covariance: Matrix, away: Vector, spread: Matrix) -> None:
+    """away ``(3,)``, spread ``(3, 3)`` <- from one end of a range to the other, and its covariance."""
+    a, o = STATES_PER_AGENT * row["agent"], row["offset_s"]
+    b = STATES_PER_AGENT * row["other"]  # negative for anchors
+    anchor = (row["x"], row["y"], row["z"])  # or, between agents, the shift of the one against the other
+    for i in range(3):
+        there = state[b + i] + o * state[b + 3 + i] - anchor[i] if b >= 0 else anchor[i]
+        away[i] = state[a + i] + o * state[a + 3 + i] - there
+        for j in range(3):
+            middle = _relative(covariance, a, b, i + 3, j) + _relative(covariance, a, b, i, j + 3)
+            ends = o * o * _relative(covariance, a, b, i + 3, j + 3)
+            spread[i, j] = _relative(covariance, a, b, i, j) + o * middle + ends
 
 
 @kernel

@@ -1,11 +1,11 @@
-"""What the linearisation of a range misses."""
+"""What the linearisation of a range, or of a speed, misses."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from estimators.model.measurements import anchor_range_row, position_rows, range_row, speed_row
+from estimators.model.measurements import anchor_range_row, position_rows, range_row, speed_row, velocity_rows
 from estimators.model.second_order import linearisation_variance
 from tests.support.builders import random_covariance
 
@@ -19,11 +19,15 @@ def test_it_is_the_mean_square_of_the_second_order_term() -> None:
     covariance = random_covariance(rng, 12, 0.5)
     offset = 0.04
     rows = np.concatenate(
-        [range_row(0, 0, 1, 0.0, 0.01, offset_s=offset), anchor_range_row(0, 1, [1.0, 2.0, 3.0], 0.0, 0.01)]
+        [
+            range_row(0, 0, 1, 0.0, 0.01, offset_s=offset),
+            anchor_range_row(0, 1, [1.0, 2.0, 3.0], 0.0, 0.01),
+            speed_row(0, 1, 0.0, 0.01),
+        ]
     )
     found = [linearisation_variance(row, state, covariance, EPS) for row in rows]
 
-    # WHEN the term 1/2 delta' T delta is drawn, with T the numeric second derivative of the range
+    # WHEN the term 1/2 delta' T delta is drawn, with T the numeric second derivative of the norm
     def second_derivative(place: np.ndarray) -> np.ndarray:
         def norm(x: np.ndarray) -> float:
             return float(np.sqrt(x @ x + EPS**2))
@@ -43,6 +47,7 @@ def test_it_is_the_mean_square_of_the_second_order_term() -> None:
     for found_here, matrix, place in (
         (found[0], between, between @ state),
         (found[1], np.hstack([np.zeros((3, 6)), np.eye(3), np.zeros((3, 3))]), state[6:9] - [1.0, 2.0, 3.0]),
+        (found[2], np.hstack([np.zeros((3, 9)), np.eye(3)]), state[9:]),
     ):
         delta = drawn @ matrix.T
         term = 0.5 * np.einsum("ki,ij,kj->k", delta, second_derivative(place), delta)
@@ -50,10 +55,12 @@ def test_it_is_the_mean_square_of_the_second_order_term() -> None:
         assert found_here == pytest.approx(float(np.mean(term**2)), rel=0.03)
 
 
-def test_other_rows_miss_nothing_and_known_places_next_to_nothing() -> None:
-    rows = np.concatenate([position_rows(0, 0, np.zeros(3), np.ones(3)), speed_row(0, 0, 1.0, 0.1)])
+def test_linear_rows_miss_nothing_and_known_states_next_to_nothing() -> None:
+    nothing, one = np.zeros(3), np.ones(3)
+    rows = np.concatenate([position_rows(0, 0, nothing, one), velocity_rows(0, 0, nothing, one)])
     state = np.arange(12.0)
     assert not any(linearisation_variance(row, state, 1e4 * np.eye(12), EPS) for row in rows)
+    assert 0.0 < linearisation_variance(speed_row(0, 0, 7.0, 0.01)[0], state, 1e-3 * np.eye(12), EPS) < 1e-6
     assert 0.0 < linearisation_variance(range_row(0, 0, 1, 10.0, 0.01)[0], state, 1e-3 * np.eye(12), EPS) < 1e-6
 
 

@@ -207,7 +207,7 @@ class FakeAutopilot:
     def _navigate(self, now: float) -> None:
         navigation = self.state.navigation
         if navigation.due(now):
-            attitude, imu = self._vehicle.attitude(), self._vehicle.imu()
+            attitude, imu = navigation.attitude(self._vehicle.attitude()), self._vehicle.imu()
             north, east, down = rotated(quaternion_of(attitude), vector_of(imu.accel_mps2))
             navigation.predict(np.array((north, east, down + self.setup.gravity_mps2)), now)
 
@@ -337,7 +337,7 @@ class FakeAutopilot:
     def _on_feed(self, message: Message, now: float) -> None:
         state = self.state
         try:
-            fed = state.feed.accept(message, self._vehicle.attitude().quaternion, now)
+            fed = state.feed.accept(message, state.navigation.attitude(self._vehicle.attitude()).quaternion, now)
         except Refused as refused:
             self._send(wire.statustext(mavlink.MAV_SEVERITY_CRITICAL, f"ODOMETRY: {refused.reason} rejected"))
             return

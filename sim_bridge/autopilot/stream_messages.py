@@ -12,6 +12,7 @@ from sim_bridge.autopilot.mavlink_wire import Message
 from sim_bridge.autopilot.state import AutopilotState, AutopilotVehicle
 from sim_bridge.autopilot.truth_messages import Geodetic, TrueState, hil_state_quaternion, sim_state, simstate
 from sim_bridge.world import quaternions
+from sim_bridge.world.sensors import SensedAttitude
 
 SENSORS_PRESENT = (
     mavlink.MAV_SYS_STATUS_SENSOR_3D_GYRO
@@ -104,11 +105,14 @@ class StreamMessages:
         unix_us = round(1e6 * (now + self._unix_offset_s)) if known else 0
         return mavlink.MAVLink_system_time_message(unix_us, self._ms(now))
 
+    def _attitude_now(self) -> SensedAttitude:
+        return self._state.navigation.attitude(self._vehicle.attitude())
+
     def _attitude(self, now: float) -> Message:
-        return wire.attitude_euler(self._ms(now), self._vehicle.attitude())
+        return wire.attitude_euler(self._ms(now), self._attitude_now())
 
     def _attitude_quaternion(self, now: float) -> Message:
-        return wire.attitude_quaternion(self._ms(now), self._vehicle.attitude())
+        return wire.attitude_quaternion(self._ms(now), self._attitude_now())
 
     def _local_position(self, now: float) -> Message | None:
         navigation = self._state.navigation
@@ -125,7 +129,7 @@ class StreamMessages:
             # ArduPilot sends zeros while it has no position
             return wire.global_position_int(self._ms(now), (0.0, 0.0, 0.0), 0.0, np.zeros(3), 0.0)
         home_m = navigation.origin_m if state.home_m is None else state.home_m
-        _, _, heading_rad = quaternions.to_euler(self._vehicle.attitude().quaternion)
+        _, _, heading_rad = quaternions.to_euler(self._attitude_now().quaternion)
         return wire.global_position_int(
             self._ms(now),
             state.geodetic(navigation.position_m),
@@ -138,7 +142,7 @@ class StreamMessages:
         navigation = self._state.navigation
         if navigation.origin_m is None:
             return None
-        attitude = self._vehicle.attitude()
+        attitude = self._attitude_now()
         inverse = quaternions.conjugate(attitude.quaternion[None])
         velocity_body = quaternions.rotate(inverse, navigation.velocity_mps[None])[0]
         return wire.odometry(self._us(now), navigation.position_m - navigation.origin_m, velocity_body, attitude)
@@ -150,7 +154,7 @@ class StreamMessages:
         return wire.home_position(
             state.geodetic(state.home_m),
             state.home_m - state.navigation.origin_m,
-            self._vehicle.attitude().quaternion,
+            self._attitude_now().quaternion,
             self._us(now),
         )
 

@@ -188,6 +188,22 @@ def test_unix_time_is_known_from_the_first_fix_on(connect):
     assert times[-1].time_unix_usec == pytest.approx(1e6 * (1.7e9 + client.arrivals["SYSTEM_TIME"][-1]), abs=2)
 
 
+def test_without_positions_the_attitude_is_tilted_until_they_come_back(connect):
+    # GIVEN an autopilot that hovers level and loses its receiver for six seconds
+    client = connect(PX4, gps_outages=(Interval(1, 3.0, 9.0),))
+    client.run_to(16.0)
+
+    def tilts(from_s, to_s):
+        for sent in client.between("ATTITUDE_QUATERNION", from_s, to_s):
+            yield np.degrees(2.0 * np.arcsin(np.hypot(sent.q2, sent.q3)))
+
+    # THEN its attitude is tilted as PX4's was measured to be, within a second of the word that it is not aided
+    level, leaning, upright = (list(tilts(*while_)) for while_ in ((1.0, 3.5), (6.0, 8.9), (14.0, 16.0)))
+    assert min(len(level), len(leaning), len(upright)) > 20
+    assert max(level) < 0.1 and max(upright) < 0.1
+    assert 1.9 < min(leaning) and max(leaning) < 2.6
+
+
 def test_px4_reports_a_lost_receiver_after_a_second_of_silence(connect):
     client = connect(PX4, gps_outages=(Interval(1, 3.0, 6.0),))
     client.set_rate(24, 10.0)

@@ -605,12 +605,17 @@ def solve_first_state(
 def add_missed(
     window: SlowWindow, rows: RowTable, path: Matrix, newest: Matrix, measured: Vector, variances: Vector
 ) -> bool:
-    """variances <- ``measured`` plus what linearisations miss where it is significant; whether any has changed."""
+    """variances <- ``measured`` plus what linearisations miss where it is significant; whether any has changed.
+
+    Of speeds only where outliers are weighted down: what they leave wrong, fixes mend that keep their weight.
+    """
     d = path.shape[1]
     covariance, changed = newest[:d, :d], False
     for k in range(path.shape[0]):
         for r in range(window.start[k], window.start[k + 1]):
-            missed = linearisation_variance(rows[r], path[k], covariance, window.eps)
+            missed = 0.0
+            if window.robust or window.code[r, 0] != SPEED:
+                missed = linearisation_variance(rows[r], path[k], covariance, window.eps)
             total = measured[r] + missed if missed > SIGNIFICANT * measured[r] else measured[r]
             changed = changed or abs(total - variances[r]) > SIGNIFICANT * variances[r]
             variances[r] = total

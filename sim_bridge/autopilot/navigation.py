@@ -22,8 +22,8 @@ VELOCITY_FROM_POSITION_PER_S = 0.3
 AIDED_S = 1.0
 """Position is called good for this long after the last fix or feed."""
 UNAIDED_TILT_RAD = math.radians(2.2)
-"""Without a position an autopilot takes part of its own motion for gravity: PX4's attitude in flight is tilted by 1.9 to
-2.6 degrees then, one way for as long as it lasts, within a second."""
+"""Without a position an autopilot takes part of its own motion for gravity: PX4's attitude in flight is tilted by 1.9
+to 2.6 degrees then, one way for as long as it lasts, within a second."""
 UPRIGHT_RAD = 1e-4
 """A smaller tilt is none."""
 TILT_TIME_S = 0.5

@@ -6,28 +6,16 @@ where the autopilot first knew its position.
 
 from __future__ import annotations
 
-import math
-from dataclasses import replace
-
 import numpy as np
 
-from sim_bridge.world import quaternions
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.sensors import GpsFix, SensedAttitude
+from sim_bridge.world.unaided import AIDED_S, UnaidedTilt
 
 PERIOD_S = 0.02
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 0.5
 VELOCITY_FROM_POSITION_PER_S = 0.3
-AIDED_S = 1.0
-"""Position is called good for this long after the last fix or feed."""
-UNAIDED_TILT_RAD = math.radians(2.2)
-"""Without a position an autopilot takes part of its own motion for gravity: PX4's attitude in flight is tilted by 1.9
-to 2.6 degrees then, one way for as long as it lasts, within a second."""
-UPRIGHT_RAD = 1e-4
-"""A smaller tilt is none."""
-TILT_TIME_S = 0.5
-"""Time constant of the tilt, when it comes and when it goes."""
 
 
 class Navigation:
@@ -39,16 +27,11 @@ class Navigation:
         self.velocity_mps: Array = np.zeros(3)
         self._aided_s = -np.inf
         self._predicted_s: float | None = None
-        self._tilt_rad: Array = np.zeros(3)
-        self._tilts_to_rad: Array = np.zeros(3)
-        """Rotation vector in NED, of the outage that lasts or was the last."""
+        self._tilt = UnaidedTilt()
 
     def attitude(self, sensed: SensedAttitude) -> SensedAttitude:
         """The attitude as the autopilot has it: tilted without positions."""
-        if not self._tilt_rad.any():
-            return sensed
-        turn = quaternions.from_rotation_vector(self._tilt_rad[None])
-        return replace(sensed, quaternion=quaternions.multiply(turn, sensed.quaternion[None])[0])
+        return self._tilt.attitude(sensed)
 
     def aided(self, now: float) -> bool:
         """Whether a position came lately."""
@@ -67,22 +50,10 @@ class Navigation:
         """Integrate the measured acceleration ``(3,)`` NED, gravity removed, up to now."""
         if self._predicted_s is not None and self.origin_m is not None:
             step_s = now - self._predicted_s
-            self._lean(step_s, self.aided(now))
+            self._tilt.step(step_s, self.aided(now), self.velocity_mps)
             self.position_m = self.position_m + step_s * self.velocity_mps + 0.5 * step_s**2 * accel_ned_mps2
             self.velocity_mps = self.velocity_mps + step_s * accel_ned_mps2
         self._predicted_s = now
-
-    def _lean(self, step_s: float, aided: bool) -> None:
-        """Let the tilt follow; its direction is that of the vehicle's motion when the positions stopped."""
-        if aided and not self._tilt_rad.any():
-            across = np.array((-self.velocity_mps[1], self.velocity_mps[0], 0.0))
-            size = float(np.linalg.norm(across))
-            self._tilts_to_rad = UNAIDED_TILT_RAD * (across / size if size > 0.0 else np.array((0.0, 1.0, 0.0)))
-            return
-        share = 1.0 - math.exp(-step_s / TILT_TIME_S)
-        self._tilt_rad = self._tilt_rad + share * ((0.0 if aided else self._tilts_to_rad) - self._tilt_rad)
-        if aided and float(np.linalg.norm(self._tilt_rad)) < UPRIGHT_RAD:
-            self._tilt_rad = np.zeros(3)
 
     def correct(self, position_m: Array, velocity_mps: Array | None, now: float) -> None:
         """Pull towards an outside position (and velocity) ``(3,)`` in the fleet frame."""

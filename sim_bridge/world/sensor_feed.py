@@ -15,6 +15,7 @@ from sim_bridge.autopilot.mavlink_wire import gps_raw_int
 from sim_bridge.world.sensors import SensedRanges, quaternion_of, vector_of
 from sim_bridge.world.simulation import Simulation
 from sim_bridge.world.truth import Truth, TruthRecorder
+from sim_bridge.world.unaided import AIDED_S, UnaidedTilt
 
 GRID_TOLERANCE = 1e-6
 
@@ -57,6 +58,10 @@ class SensorFeed:
         scenario, step_s = simulation.scenario, simulation.world.step_s
         self._imu = _StepGrid(min(imu_hz, scenario.imu_hz), step_s)
         self._attitude = _StepGrid(min(attitude_hz, scenario.attitude_hz), step_s)
+        self._attitude_period_s = 1.0 / min(attitude_hz, scenario.attitude_hz)
+        self._tilts = [UnaidedTilt() for _ in scenario.ids]
+        self._aided_until_s: list[float | None] = [None for _ in scenario.ids]
+        """World time; nothing before the first fix."""
         self._truth_every = max(round(1.0 / (scenario.truth_hz * step_s)), 1)
         self._recorder = TruthRecorder(scenario.ids, simulation.sensors.pair_bias_m)
         self._record()
@@ -72,16 +77,26 @@ class SensorFeed:
         imu_due, attitude_due = self._imu.due(world.step_index), self._attitude.due(world.step_index)
         for slot, agent_id in enumerate(scenario.ids):
             if attitude_due:
-                attitude = AttitudeSample(t_s, quaternion_of(sensors.attitude(slot)))
-                sensed.samples.append((agent_id, attitude))
+                sensed.samples.append((agent_id, self._attitude_sample(slot, t_s)))
             if imu_due:
                 imu = sensors.imu(slot)
                 sample = ImuSample(t_s, vector_of(imu.accel_mps2), vector_of(imu.gyro_rps))
                 sensed.samples.append((agent_id, sample))
         for slot, fix in sensors.fixes():
             if fix.valid:
+                self._aided_until_s[slot] = world.time_s + AIDED_S
                 sensed.fixes.append((scenario.ids[slot], gps_raw_int(round(1e6 * fix.time_s), fix)))
         return sensed
+
+    def _attitude_sample(self, slot: int, t_s: float) -> AttitudeSample:
+        """As the autopilot of a vehicle has it, and its word whether it is aided."""
+        world, until_s = self._simulation.world, self._aided_until_s[slot]
+        sensed = self._simulation.sensors.attitude(slot)
+        if until_s is None:
+            return AttitudeSample(t_s, quaternion_of(sensed))
+        aided = world.time_s <= until_s
+        self._tilts[slot].step(self._attitude_period_s, aided, world.velocity_mps[slot])
+        return AttitudeSample(t_s, quaternion_of(self._tilts[slot].attitude(sensed)), aided)
 
     def truth(self) -> Truth:
         """What happened so far."""

@@ -371,8 +371,9 @@ class FleetSensors:
         if not arms.any():
             return world.position_m, world.velocity_mps, world.accel_mps2
         rates = world.body_rates()
-        moves = np.cross(rates, arms)
-        turned = [quaternions.rotate(world.attitude(), each) for each in (arms, moves, np.cross(rates, moves))]
+        moves: Array = np.cross(rates, arms)
+        bends: Array = np.cross(rates, moves)
+        turned = [quaternions.rotate(world.attitude(), each) for each in (arms, moves, bends)]
         return world.position_m + turned[0], world.velocity_mps + turned[1], world.accel_mps2 + turned[2]
 
     def _fix(self, slot: int, position: Array, velocity: Array, place: Array) -> GpsFix:

@@ -85,7 +85,9 @@ class _Track:
 
     def since(self, ticks: float) -> tuple[Vector, Vector]:
         """How far it has moved in the last (or, below zero, the next) ticks and parts of one, and the half width."""
-        moved, slack, left = np.zeros(3), np.zeros(3), abs(ticks)
+        moved: Vector = np.zeros(3)
+        slack: Vector = np.zeros(3)
+        left = abs(ticks)
         for step, half in reversed(self._steps):
             share = min(left, 1.0)
             if share <= 0.0:
@@ -185,7 +187,8 @@ class SetBank:
         ticks = 1 if self._tick is None else evidence.tick - self._tick
         steps = {}
         for agent, track in self._tracks.items():
-            moved, slack = np.zeros(3), np.zeros(3)
+            moved: Vector = np.zeros(3)
+            slack: Vector = np.zeros(3)
             for k in range(ticks):
                 t_s = (evidence.tick - ticks + 1 + k) * self._period_s
                 step, width = track.step(t_s, self._period_s, self._bounds)

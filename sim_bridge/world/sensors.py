@@ -371,8 +371,8 @@ class FleetSensors:
         if not arms.any():
             return world.position_m, world.velocity_mps, world.accel_mps2
         rates = world.body_rates()
-        moves: Array = np.cross(rates, arms)
-        bends: Array = np.cross(rates, moves)
+        moves = np.asarray(np.cross(rates, arms), np.float64)
+        bends = np.asarray(np.cross(rates, moves), np.float64)
         turned = [quaternions.rotate(world.attitude(), each) for each in (arms, moves, bends)]
         return world.position_m + turned[0], world.velocity_mps + turned[1], world.accel_mps2 + turned[2]
 

@@ -62,7 +62,8 @@ class _Track:
         self._velocity, self._half = np.zeros(3), np.full(3, np.inf)
         self._measured_s = np.zeros(3)
         self._steps: deque[tuple[Vector, Vector]] = deque(maxlen=LATE_TICKS)
-        self.low, self.high = np.full(3, -np.inf), np.full(3, np.inf)
+        self.low: Vector = np.full(3, -np.inf)
+        self.high: Vector = np.full(3, np.inf)
 
     def hear_velocity(self, axis: int, value: float, half_width: float, t_s: float) -> None:
         """A velocity of an instant, per axis; an older one is left out."""

@@ -200,8 +200,13 @@ class AgentCore:
         self.records.neighbourhood.hear(sender, self._tick)
         if message.tick < self._tick or (message.tick == self._tick and self._phase is _Phase.ROUND):
             self.counters["measurements: late"] += 1
-        for record in self.records.add_heard(sender, message.records, self._tick):
+        for record in self._heard_records(sender, message):
             self.fleet.note(record, self._tick)
+
+    def _heard_records(self, sender: int, message: Measurements) -> list[Measurement]:
+        """The records of a packet that are new."""
+        assert self._tick is not None
+        return self.records.add_heard(sender, message.records, self._tick, message.proofs, message.acks)
 
     def _on_information(self, sender: int, message: Information | WindowStates, now_s: float) -> None:
         outcome = self._barrier.put(sender, message.tick, message.round, message)

@@ -29,9 +29,10 @@ from sim_bridge.sitl.mission import load_mission
 from tests.support.command_names import complaint
 from tests.support.doc_pages import DOCS, FENCE, PAGES, ROOT, Block, blocks, written_commands
 from transport.errors import Reason
-from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
+from transport.messages.header import MAX_DATAGRAM_BODY_BYTES, SIGNATURE_BYTES
 from transport.messages.information_body import content_bytes
 from transport.messages.measurement_body import RECORD_BYTES, MeasurementKind
+from transport.messages.proofs import acks_bytes
 
 SITE = ROOT / "mkdocs.yml"
 LINK = re.compile(r"!?\[[^\]]*\]\(([^)\s]+)\)")
@@ -355,8 +356,16 @@ def test_the_budget_of_the_wire_is_that_of_the_codecs() -> None:
     fix = sizes[MeasurementKind.POSITION] + sizes[MeasurementKind.VELOCITY] + sizes[MeasurementKind.ACCELERATION]
     own = [fix + (n - 1) * sizes[MeasurementKind.RANGE] for n in (3, 5, 10)]
     assert budget("own measurements of a tick") == own
-    assert budget("first and second exchange") == [n * s for n, s in zip((3, 5, 10), own, strict=True)]
-    assert budget("own ticks in one packet") == [MAX_DATAGRAM_BODY_BYTES // s for s in own]
+    records = [3 + n - 1 for n in (3, 5, 10)]
+    fleets = list(zip((3, 5, 10), own, records, strict=True))
+    proof = 4 + SIGNATURE_BYTES
+    assert budget("unsigned, second exchange") == [n * s for n, s, _ in fleets]
+    assert budget("unsigned, own ticks in one packet") == [MAX_DATAGRAM_BODY_BYTES // s for s in own]
+    assert budget("signed, first exchange") == [s + proof + r for _, s, r in fleets]
+    acknowledged = [(n - 1) * (s + proof + r) + acks_bytes((n - 1) * r) for n, s, r in fleets]
+    assert budget("signed, second exchange") == acknowledged
+    ticks = [(MAX_DATAGRAM_BODY_BYTES - proof) // (s + r) for _, s, r in fleets]
+    assert budget("signed, own ticks under one proof") == ticks
     page = (DOCS / "architecture.md").read_text(encoding="utf-8")
     told = re.findall(
         r"position (\d+), velocity (\d+), speed (\d+), range (\d+), anchor range (\d+), acceleration (\d+), and with "

@@ -42,6 +42,8 @@ class Reason(StrEnum):
     """Encrypted with a key we do not have, for another stream, or changed on the way."""
     UNSIGNED = "unsigned"
     BAD_SIGNATURE = "bad_signature"
+    BAD_PROOF = "bad_proof"
+    """What its sender relays was not made by whom it names as its owner."""
     DUPLICATE = "duplicate"
     """The same packet again; harmless, networks do that."""
     REPLAY = "replay"

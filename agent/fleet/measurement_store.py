@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter, deque
-from collections.abc import Container, Iterable, Iterator, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 from agent.config.tables import FleetConfig
@@ -12,7 +12,6 @@ from agent.fleet.measurements import inputs_of, rows_of
 from agent.fleet.neighbourhood import Neighbourhood
 from estimators.model.measurements import InputTable, RowTable
 from transport.errors import EncodeError
-from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
     Measurement,
@@ -20,7 +19,9 @@ from transport.messages.measurement_body import (
     OrientationMeasurement,
     RangeMeasurement,
     as_sent,
+    fitting,
 )
+from transport.messages.proofs import Proof, acknowledged_by, by_origin, origin
 
 KEEP_TICKS = 64
 """Records older than this are forgotten; no window reaches that far."""
@@ -39,6 +40,8 @@ class _Kept:
     held_by: set[int] = field(default_factory=set)
     sent: int = 0
     """Packets that carried it, counted where that is limited."""
+    proof: Proof | None = None
+    """Of its origin, where it is to be relayed with one."""
     most: int | None = None
     """After so many it is sent no more; ``None``: never mind how many."""
 
@@ -85,6 +88,8 @@ class MeasurementStore:
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
         self._arms = LeverArms(config)
+        self._acked: dict[int, dict[bytes, _Kept]] = {}
+        """By tick, what is kept by what acknowledges it."""
         self._kept: dict[int, dict[bytes, _Kept]] = {}
         """The records taken in, by tick and identity."""
         self._to_send: dict[int, _OnItsWay] = {}
@@ -95,6 +100,8 @@ class MeasurementStore:
         """What was heard since the last packet, by its identity."""
         self._rows: list[Measurement] = []
         self._inputs: list[AccelerationMeasurement] = []
+        self._proven = False
+        """Whether neighbours prove the origin of what they relay: in signed fleets."""
         self.refused: Counter[str] = Counter()
         self.unturned = 0
         """Ranges that were used without knowing where their antennas pointed."""
@@ -111,22 +118,50 @@ class MeasurementStore:
         self._add(rounded)
         return rounded
 
-    def add_heard(self, sender: int, records: Iterable[Measurement], tick: int) -> list[Measurement]:
-        """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back."""
+    def add_heard(
+        self,
+        sender: int,
+        records: Iterable[Measurement],
+        tick: int,
+        proofs: tuple[Proof, ...] | None = None,
+        acks: Iterable[bytes] = (),
+    ) -> list[Measurement]:
+        """Take in the records of a neighbour's packet, while ``tick`` is the current one; those taken come back.
+
+        With ``proofs``, if only of none, what is new and somebody else's has to be among what they cover. ``acks``
+        acknowledge what was sent.
+        """
+        self._proven = self._proven or proofs is not None
+        proof_of = by_origin(proofs or ())
         taken = []
         for record in records:
             kept = self._kept_of(record)
+            proof = proof_of.get(origin(record)) if proof_of else None
             if self._wanted(record, tick):
-                if self._echoes_back(record, sender):
-                    self._echoes[record.identity] = record
                 if kept is None:
+                    if proof is None and proofs is not None and record.observer != sender:
+                        self.refused[f"heard: not proven, of {sender}"] += 1
+                        continue
                     kept = self._add(record)
                     taken.append(record)
-            if kept is not None and sender not in kept.held_by:
-                kept.held_by.add(sender)
-                if record.observer == self._agent_id:
-                    self._echoed_after.append(max(tick - record.tick, 0))
+                if self._echoes_back(record, sender):
+                    self._echoes[record.identity] = kept.record
+                if proof is not None and (kept.proof is None or record.observer == sender):
+                    kept.proof = proof
+            if kept is not None:
+                self._note_held(kept, sender, tick)
+        for ack in acks:
+            for of_tick in self._acked.values():
+                if ack in of_tick:
+                    self._note_held(of_tick[ack], sender, tick)
         return taken
+
+    def _note_held(self, kept: _Kept, sender: int, tick: int) -> None:
+        """A neighbour has said, at a tick, that it has a record."""
+        if sender not in kept.held_by:
+            kept.held_by.add(sender)
+            if kept.record.observer == self._agent_id:
+                self._echoed_after.append(max(tick - kept.record.tick, 0))
 
     def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
         """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
@@ -177,6 +212,7 @@ class MeasurementStore:
         self._arms.forget(first)
         for old in [t for t in self._kept if t < tick - KEEP_TICKS]:
             self._kept.pop(old)
+            self._acked.pop(old, None)
             self._to_send.pop(old, None)
 
     def packet(self, tick: int, exchange: int, neighbours: frozenset[int]) -> Measurements:
@@ -187,10 +223,31 @@ class MeasurementStore:
         if self.neighbourhood.relays_times is not None:
             records = self._counted(tick, exchange, neighbours)
         else:
-            records = {kept.record.identity: kept.record for kept in self._lacking(tick, neighbours)}
-            records.update((name, record) for name, record in self._newest_echoes() if name not in records)
+            lacking = list(self._lacking(tick, neighbours))
+            if self._proven and exchange == 1:  # nobody can have said back yet what went out first
+                lacking.sort(key=self._went_out_in(tick))
+            records = {kept.record.identity: kept.record for kept in lacking}
+            if not self._proven:
+                records.update((name, record) for name, record in self._newest_echoes() if name not in records)
+        told = tuple(records.values())
+        proofs = acks = None
+        if self._proven:
+            proofs = self._proofs_of(told)
+            acks = tuple(acknowledged_by(echo.digest) for name, echo in self._newest_echoes() if name not in records)
         self._echoes = {}
-        return Measurements(tick, tuple(records.values()), exchange)
+        return Measurements(tick, told, exchange, proofs, acks or ())
+
+    def _went_out_in(self, tick: int) -> Callable[[_Kept], bool]:
+        return lambda kept: kept.record.tick == tick and kept.record.observer == self._agent_id
+
+    def _proofs_of(self, records: Iterable[Measurement]) -> tuple[Proof, ...]:
+        """The proofs of others' records that are to be relayed; an echo needs none."""
+        proofs: dict[Proof, None] = {}
+        for record in records:
+            kept = self._kept_of(record)
+            if kept is not None and kept.proof is not None and self.neighbourhood.sends(record):
+                proofs[kept.proof] = None
+        return tuple(proofs)
 
     def _lacking(self, tick: int, neighbours: frozenset[int]) -> Iterator[_Kept]:
         """What some neighbour may lack, of the newest tick first."""
@@ -212,17 +269,15 @@ class MeasurementStore:
             if not (kept.sent and exchange == 1 and kept.record.tick == tick)  # nobody can have said it back yet
         ]
         new = {kept.record.identity: kept.record for kept in lacking if not kept.sent}
-        records = new | dict(self._newest_echoes())
+        records = new if self._proven else new | dict(self._newest_echoes())
         records |= {kept.record.identity: kept.record for kept in lacking}
-        room_bytes, fitting = MAX_DATAGRAM_BODY_BYTES, set[bytes]()
-        for name, record in records.items():
-            room_bytes -= len(record.wire or b"")
-            if room_bytes < 0:
-                break
-            fitting.add(name)
+        owner = self._agent_id if self._proven else None
+        told = list(records.items())
+        proofs = self._proofs_of(records.values()) if self._proven else ()
+        records = dict(told[: fitting([record for _, record in told], proofs, owner)])
         for kept in lacking:
-            kept.sent += kept.record.identity in fitting
-        return {name: records[name] for name in records if name in fitting}
+            kept.sent += kept.record.identity in records
+        return records
 
     def lacked(self, tick: int, neighbours: frozenset[int]) -> bool:
         """Whether one of ``neighbours`` may lack a record of a tick before this one that it is to get.
@@ -271,6 +326,7 @@ class MeasurementStore:
     def _add(self, record: Measurement) -> _Kept:
         """Take in a record that is not there yet."""
         kept = self._kept.setdefault(record.tick, {})[record.identity] = _Kept(record)
+        self._acked.setdefault(record.tick, {})[acknowledged_by(record.digest)] = kept
         is_own = record.observer == self._agent_id
         kept.most = None if is_own else self.neighbourhood.relays_times
         self.neighbourhood.note(record)

@@ -9,16 +9,20 @@ earlier ones; every record names the agent whose sensor it is. Wire form of a re
 ``age`` is the packet's tick minus the record's. Sigmas and half widths are rounded up, never down, so the
 receiver never trusts a sensor more than its owner does; a half width beyond float16 becomes "no bound".
 
+In a signed fleet the proofs of the records' origin stand behind them (`transport.messages.proofs`).
+
 The same records come and go many times, sent again and relayed. So each is worked out once: a record remembers its
 identity and its bytes, and bytes that were decoded of late are known again by all of them.
 """
 
 from __future__ import annotations
 
+import hashlib
 import math
 import struct
+from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import IntEnum
 from functools import cached_property, lru_cache
 from typing import ClassVar, NamedTuple
@@ -27,6 +31,17 @@ from transport.errors import EncodeError, Reason, Rejected
 from transport.link.streams import MAX_AGENT_ID, MIN_AGENT_ID
 from transport.messages.half_floats import half_up
 from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
+from transport.messages.proofs import (
+    ACKS_AHEAD,
+    DIGEST_BYTES,
+    Proof,
+    ProofBytes,
+    Prover,
+    acks_bytes,
+    decode_proofs,
+    encode_acks,
+    encode_proofs,
+)
 from transport.messages.uwb_body import MAX_TAGS
 
 Triple = tuple[float, float, float]
@@ -97,6 +112,12 @@ class _Record:
     def wire(self) -> bytes | None:
         """The record's bytes with age 0, ``None`` if it is too uncertain to be worth any; raises `EncodeError`."""
         return _encode_record(self)
+
+    @cached_property
+    def digest(self) -> bytes:
+        """Eight bytes that stand for all of the record, its tick with it; raises `EncodeError`."""
+        told = _TICK.pack(self.tick) + (self.wire or b"")
+        return hashlib.blake2b(told, digest_size=DIGEST_BYTES).digest()
 
     def parts(self) -> _Parts:
         """The record's numbers."""
@@ -272,6 +293,7 @@ _LAYOUT: dict[int, struct.Struct] = {
 _AGE_AT = 3
 """Where the age stands in a record."""
 _IDENTITY = struct.Struct("<BHq")
+_TICK = struct.Struct("<q")
 _SINGLES = [struct.Struct(f"<{count}f") for count in range(5)]
 """What follows the identity's head: an agent's id is exact as a float32."""
 RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
@@ -281,12 +303,16 @@ RECORD_BYTES = {kind: layout.size for kind, layout in _LAYOUT.items()}
 class Measurements:
     """Body of a measurement packet: the records an agent tells at ``tick``, what matters most first.
 
-    ``exchange`` counts the packets of a tick from 0; it travels as the header's round.
+    ``exchange`` counts the packets of a tick from 0; it travels as the header's round. ``proofs`` are of the origin
+    of relayed records; ``None`` where nobody asks for them: in unsigned fleets, in packets of version 1.
+    ``acks`` say of whose records we have that their owners need not tell them again (`transport.messages.proofs`).
     """
 
     tick: int
     records: tuple[Measurement, ...]
     exchange: int = 0
+    proofs: tuple[Proof, ...] | None = field(default=None, compare=False)
+    acks: tuple[bytes, ...] = field(default=(), compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -309,43 +335,78 @@ def as_sent(record: Measurement) -> Measurement:
 
 
 def encode_measurements(
-    measurements: Measurements, *, limit_bytes: int = MAX_DATAGRAM_BODY_BYTES
+    measurements: Measurements, *, limit_bytes: int = MAX_DATAGRAM_BODY_BYTES, prover: Prover | None = None
 ) -> EncodedMeasurements:
-    """Records as bytes, in the order given, cut at ``limit_bytes``.
+    """Records as bytes, in the order given, cut at ``limit_bytes``; with a ``prover`` their proofs behind them.
 
     Raises `EncodeError` for a record that is not a measurement: NaN, no variance, an id that is none, a tick
     later than the packet's.
     """
-    body, count = bytearray(), 0
+    tick, proofs = measurements.tick, measurements.proofs or ()
+    sent: list[Measurement] = []
     for record in measurements.records:
-        age = measurements.tick - record.tick
-        if age < 0:
-            raise EncodeError(f"{record}: expected a tick from 0 to the packet's tick {measurements.tick}")
-        wire = record.wire
-        if wire is None or age > MAX_AGE_TICKS:
-            continue
+        if record.tick > tick:
+            raise EncodeError(f"{record}: expected a tick from 0 to the packet's tick {tick}")
+        if record.wire is not None and tick - record.tick <= MAX_AGE_TICKS:
+            sent.append(record)
+    owner = None if prover is None else prover.owner
+    reserved = acks_bytes(min(len(measurements.acks), ACKS_AHEAD)) if prover is not None else 0
+    sent = sent[: fitting(sent, proofs, owner, limit_bytes=limit_bytes - reserved)]
+    body = bytearray()
+    for record in sent:
         at = len(body)
-        if at + len(wire) > limit_bytes:
-            break  # what follows matters less: better nothing than that in place of this one
-        body += wire
-        body[at + _AGE_AT] = age
-        count += 1
-    return EncodedMeasurements(bytes(body), count, len(measurements.records) - count)
+        body += record.wire or b""
+        body[at + _AGE_AT] = tick - record.tick
+    if prover is not None:
+        body += encode_proofs(sent, proofs, prover)
+        body += encode_acks(measurements.acks, limit_bytes - len(body))
+    return EncodedMeasurements(bytes(body), len(sent), len(measurements.records) - len(sent))
+
+
+def fitting(
+    records: Sequence[Measurement],
+    proofs: Sequence[Proof],
+    owner: int | None,
+    *,
+    limit_bytes: int = MAX_DATAGRAM_BODY_BYTES,
+) -> int:
+    """How many of the first of ``records`` fit into a body with their proofs; ``owner`` None: without proofs.
+
+    What follows matters less: better nothing than that in place of the first that does not fit.
+    """
+    proof_bytes = None if owner is None else ProofBytes(proofs, owner)
+    size, fitted = 0, 0
+    for count, record in enumerate(records, 1):
+        size += len(record.wire or b"")
+        if proof_bytes is not None:
+            size += proof_bytes.added_by(record)  # may be less than nothing, so that the next may fit again
+        if size <= limit_bytes:
+            fitted = count
+        elif proof_bytes is None:
+            break
+    return fitted
 
 
 def decode_measurements(
-    body: bytes, *, tick: int, count: int, roster: AbstractSet[int], exchange: int = 0
+    body: bytes, *, tick: int, count: int, roster: AbstractSet[int], exchange: int = 0, proven: bool = False
 ) -> Measurements:
-    """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good."""
-    records, named = _decode_body(body, tick, count)
+    """Records of a body; the header says ``tick``, ``count``, ``exchange``. Raises `Rejected` unless all are good.
+
+    ``proven``: whether proofs follow; their signatures are not looked at here.
+    """
+    records, named, end = _decode_body(body, tick, count)
     if not named <= roster:
         raise Rejected(Reason.UNKNOWN_AGENT, f"record of agent {min(named - roster)}")
-    return Measurements(tick, records, exchange)
+    if not proven and end != len(body):
+        raise Rejected(Reason.MALFORMED, f"{len(body) - end} bytes after the last record")
+    if not proven:
+        return Measurements(tick, records, exchange)
+    return Measurements(tick, records, exchange, *decode_proofs(body[end:], records))
 
 
 @lru_cache(BODIES_KNOWN_AGAIN)
-def _decode_body(body: bytes, tick: int, count: int) -> tuple[tuple[Measurement, ...], frozenset[int]]:
-    """The records of a body, and all agents that they name."""
+def _decode_body(body: bytes, tick: int, count: int) -> tuple[tuple[Measurement, ...], frozenset[int], int]:
+    """The records of a body, all agents that they name, and where the last one ends."""
     records: list[Measurement] = []
     at, size = 0, len(body)
     for _ in range(count):
@@ -356,11 +417,9 @@ def _decode_body(body: bytes, tick: int, count: int) -> tuple[tuple[Measurement,
         wire = body[at:age_at] + b"\0" + body[age_at + 1 : end]
         records.append(_decode_record(wire, tick - body[age_at]))
         at = end
-    if at != size:
-        raise Rejected(Reason.MALFORMED, f"{size - at} bytes after the last record")
     named = {record.observer for record in records}
     named.update(record.other for record in records if isinstance(record, RangeMeasurement))
-    return tuple(records), frozenset(named)
+    return tuple(records), frozenset(named), at
 
 
 def forget_decoded() -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from transport.errors import Reason, Rejected, SettingsError
 from transport.link.peers import PeerTable
@@ -26,6 +26,7 @@ from transport.messages.header import (
 )
 from transport.messages.information_body import decode_part
 from transport.messages.measurement_body import Measurements, decode_measurements
+from transport.messages.proofs import genuine
 from transport.messages.reassembly import Reassembler
 from transport.messages.report_body import decode_diagnostics
 from transport.messages.window_body import decode_window
@@ -165,7 +166,11 @@ class Opener:
         h, double = header, bool(header.flags & FLAG_FLOAT64)
         match header.kind:
             case PacketKind.MEAS:
-                return decode_measurements(body, tick=h.tick, count=h.n, roster=self._roster, exchange=h.round)
+                proven = h.version > 1 and not isinstance(self._trust, Unsigned)
+                message = decode_measurements(
+                    body, tick=h.tick, count=h.n, roster=self._roster, exchange=h.round, proven=proven
+                )
+                return self._with_genuine_proofs(message, h) if proven else message
             case PacketKind.INFO:
                 part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)
@@ -184,6 +189,14 @@ class Opener:
                 if report.agent_id != h.sender:
                     raise Rejected(Reason.OUT_OF_RANGE, f"{h.kind.name} of agent {report.agent_id}")
                 return report
+
+    def _with_genuine_proofs(self, message: Measurements, header: Header) -> Measurements:
+        """A message with the proofs that hold; the others are counted, and their records come without."""
+        assert not isinstance(self._trust, Unsigned)
+        others = (proof for proof in message.proofs or () if proof.owner != self._own_id)
+        good, bad = genuine(others, self._trust, fleet=header.fleet, agreement=header.agreement)
+        self.peers.rejected(header.sender, Reason.BAD_PROOF, bad)
+        return replace(message, proofs=good)
 
     def _count_expired(self, sender: int, parts: int) -> None:
         self.peers.rejected(sender, Reason.PART_EXPIRED, parts)

@@ -21,6 +21,7 @@ from transport.messages.header import (
 )
 from transport.messages.information_body import Information, encode_information, float32_suffices
 from transport.messages.measurement_body import Measurements, encode_measurements
+from transport.messages.proofs import Prover
 from transport.messages.report_body import Diagnostics, encode_diagnostics
 from transport.messages.window_body import WindowStates, encode_window
 from transport.security.auth import Signing, Unsigned, sign
@@ -64,6 +65,9 @@ class Sealer:
         self._agreement = agreement
         self._boot = boot
         self._signing = signing
+        self._prover = None
+        if not isinstance(signing, Unsigned):
+            self._prover = Prover(agent_id, self._fleet, agreement, signing)
         self._seq = dict.fromkeys(PacketKind, 0)
         self.left_out = 0
         self.sent = 0
@@ -79,7 +83,7 @@ class Sealer:
     def _bodies(self, message: Message, double: bool | None) -> list[_Body]:
         match message:
             case Measurements():
-                encoded = encode_measurements(message)
+                encoded = encode_measurements(message, prover=self._prover)
                 self.left_out += encoded.left_out
                 return [_Body(PacketKind.MEAS, encoded.body, message.tick, message.exchange, encoded.count)]
             case Information():

@@ -18,7 +18,7 @@ def fusion(
     seed: Annotated[int, typer.Option("--seed")] = 0,
     json_file: Annotated[Path | None, typer.Option("--json", help="Write the figures here too.")] = None,
 ) -> None:
-    """Fu, Bi and Gao's filters over a channel that holds and delays.
+    """Fu, Bi and Gao's filters over a channel that delays.
 
     By Monte Carlo, beside the figures of an independent implementation.
     """

@@ -32,7 +32,7 @@ Methods = Annotated[str, typer.Option(help="Names, separated by commas; empty: a
 def register(app: typer.Typer) -> None:
     """Add the command group to the command line."""
     bench = typer.Typer(
-        help="Studies: accuracy, loss, faults, scale, speed, sets, Table I.", rich_markup_mode=None
+        help="Studies: accuracy, loss, faults, scale, speed, sets, real.", rich_markup_mode=None
     )
     bench.callback()(_group)
     bench.command("table1")(table1)
@@ -45,6 +45,7 @@ def register(app: typer.Typer) -> None:
     bench.command("faults")(faults)
     bench.command("scale")(scale)
     bench.command("setmembership")(setmembership)
+    bench.command("real")(real)
     app.add_typer(bench, name="bench")
 
 
@@ -153,7 +154,7 @@ def loss(
     out: OutFolder = None,
     json_file: JsonFile = None,
 ) -> None:
-    """The same when packets are lost, late, doubled or out of order.
+    """The same with packets lost, late or doubled.
 
     Beside it stands what could be known.
     """
@@ -273,7 +274,7 @@ def scale(
     jobs: Annotated[int, typer.Option(min=0, max=256, help="Processes at a time; 0: one per processor.")] = 1,
     json_file: JsonFile = None,
 ) -> None:
-    """Fleets of up to a hundred drones: what each costs and knows.
+    """Fleets of up to a hundred drones: costs, knowledge.
 
     On random geometric graphs, in virtual time; beyond some size a drone's state is that of its neighbourhood.
     """
@@ -353,6 +354,27 @@ def _whole_numbers(option: str, text: str, low: int, high: int) -> list[int]:
     if any(value != int(value) for value in values):
         raise InputError(option, "", f"whole numbers from {low} to {high}, separated by commas", text)
     return [int(value) for value in values]
+
+
+def real(
+    folder: Annotated[Path, typer.Argument(metavar="FOLDER", help="Holds tiers.pyfg and 20221011_processed.csv.")],
+    odometry_sigma_m: Annotated[
+        float, typer.Option("--odometry-sigma", min=1e-4, help="Of a step of odometry, m per axis.")
+    ] = 0.005,
+    range_sigma_factor: Annotated[
+        float, typer.Option("--range-sigma-factor", min=0.1, help="On the file's sigma of ranges, which err alike.")
+    ] = 2.0,
+    json_file: JsonFile = None,
+) -> None:
+    """Recorded real robots: TIERS, odometry and one anchor.
+
+    With the ranges as their authors calibrated them, and with the biases of the raw ones put back.
+    """
+    from fleetloc.bench.real import run_real
+    from fleetloc.warmup import announce
+
+    announce()
+    run_real(folder, odometry_sigma_m, range_sigma_factor, json_file)
 
 
 def speed(

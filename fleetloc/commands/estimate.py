@@ -1,4 +1,4 @@
-"""``fleetloc estimate``: run an estimator over a study input."""
+"""``fleetloc estimate``: run an estimator over a study input; ``fleetloc import``: make one of another recording."""
 
 from __future__ import annotations
 
@@ -14,9 +14,22 @@ if TYPE_CHECKING:
     from sim_bridge.studies.study_input import StudyInput
 
 
+Source = Annotated[Path, typer.Argument(metavar="FILE", help="The recording.")]
+Out = Annotated[Path, typer.Option("--out", metavar="FILE", help="The study input to write (.npz).")]
+Period = Annotated[float, typer.Option("--period", metavar="S", min=0.001, help="Length of a tick, s.")]
+AccelSigma = Annotated[
+    float, typer.Option("--accel-sigma", min=1e-3, help="Of accelerations, which nobody measured, m/s2 per axis.")
+]
+
+
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
+    """Add the commands to the command line."""
     app.command("estimate")(estimate)
+    group = typer.Typer(help="Make study inputs of other recordings: csv, pyfg.", rich_markup_mode=None)
+    group.callback()(_group)
+    group.command("csv")(csv)
+    group.command("pyfg")(pyfg)
+    app.add_typer(group, name="import")
 
 
 def estimate(
@@ -104,3 +117,38 @@ def _print(study_input: StudyInput, figures: dict[str, Any]) -> None:
             row += [f"{agent[key]:.4f}" for key in keys]
         rows.append(row)
     print_table(columns, rows)
+
+
+def _group() -> None:
+    """Make study inputs of recordings in other formats."""
+
+
+def csv(file: Source, out: Out, period: Period = 0.1, accel_sigma: AccelSigma = 0.5) -> None:
+    """Rows as text, one measurement a line.
+
+    The columns are time_s, kind, body, other, value and sigma (docs/replay.md).
+    """
+    from sim_bridge.studies.imports.csv_rows import study_of_csv
+    from sim_bridge.studies.imports.row_builder import Start
+
+    study_of_csv(file, period, Start(accel_mps2=accel_sigma)).save(_named(out))
+
+
+def pyfg(file: Source, out: Out, period: Period = 0.1, accel_sigma: AccelSigma = 0.5) -> None:
+    """Planar factor graphs in the text format of PyFG.
+
+    Odometry becomes velocities, landmarks become anchors.
+    """
+    from sim_bridge.studies.imports.pyfg import read_pyfg, study_of_graph
+    from sim_bridge.studies.imports.row_builder import Start
+
+    study_of_graph(read_pyfg(file), period, Start(accel_mps2=accel_sigma)).save(_named(out))
+
+
+def _named(out: Path) -> Path:
+    """numpy puts .npz behind another name, which nobody asked for."""
+    from fleetloc.errors import InputError
+
+    if out.suffix != ".npz":
+        raise InputError("--out", "", "a file name that ends in .npz", out.name)
+    return out

@@ -169,6 +169,8 @@ def fly_recording(
 def config_of(recording: StudyInput, settings: EstimatorSettings) -> FleetConfig:
     """The configuration of a fleet that flies an input: its sensors' bounds, its edges, nobody to sign."""
     ids = [int(agent) for agent in recording.agents]
+    if recording.rows is not None:
+        raise ValueError("rows: expected a study input of version 1, whose measurements agents can fly with")
     half = recording.gps_half_width
     if not half[0] == half[1] == half[2]:
         raise ValueError(f"gps_half_width: expected one bound for all axes, found {half[:3].tolist()}")

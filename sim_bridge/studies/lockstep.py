@@ -63,6 +63,8 @@ def own_rows(recording: StudyInput, tick: int, slot: int) -> RowTable:
     for other in np.flatnonzero(np.isfinite(recording.ranges[tick, slot])):
         measured = recording.ranges[tick, slot, other]
         tables.append(range_row(tick, slot, int(other), measured, bound**2 / 3, half_width_m=bound))
+    if recording.rows is not None:
+        tables.append(recording.rows.of(tick, slot))
     return np.concatenate(tables) if tables else empty_rows()
 
 

@@ -107,4 +107,7 @@ def _record_bytes(recording: StudyInput) -> NDArray[np.int64]:
     fixes = np.isfinite(recording.gps[:, :, :3]).all(axis=-1)
     speeds = np.isfinite(recording.gps[:, :, 3])
     ranges = np.isfinite(recording.ranges).sum(axis=-1)
-    return np.asarray(ACCEL_BYTES + POSITION_BYTES * fixes + SPEED_BYTES * speeds + RANGE_BYTES * ranges, np.int64)
+    more = 0 if recording.rows is None else recording.rows.bytes(*fixes.shape)
+    return np.asarray(
+        ACCEL_BYTES + POSITION_BYTES * fixes + SPEED_BYTES * speeds + RANGE_BYTES * ranges + more, np.int64
+    )

@@ -15,6 +15,8 @@ import numpy as np
 from numpy.lib.npyio import NpzFile
 from numpy.typing import NDArray
 
+from sim_bridge.studies.study_rows import RowKind, StudyRows
+
 Floats = NDArray[np.float64]
 
 
@@ -54,6 +56,8 @@ class StudyInput:
     delay_ticks : ``(T+1, n, n)`` int
         How many ticks late they did.
     truth : ``(T+1, n, 6)``, optional
+    rows : optional
+        Further measurements, in a file of version 2.
     """
 
     period_s: float
@@ -70,6 +74,7 @@ class StudyInput:
     received: NDArray[np.bool_]
     delay_ticks: NDArray[np.int64]
     truth: Floats | None = None
+    rows: StudyRows | None = None
 
     @property
     def ticks(self) -> int:
@@ -78,8 +83,16 @@ class StudyInput:
 
     def save(self, path: Path) -> None:
         """Write the file; optional arrays that are absent are left out."""
-        arrays = {field.name: getattr(self, field.name) for field in fields(self)}
+        arrays = {field.name: getattr(self, field.name) for field in fields(self) if field.name != "rows"}
+        if self.rows is not None:
+            arrays["version"] = 2
+            arrays |= {_array_of(field.name): getattr(self.rows, field.name) for field in fields(self.rows)}
         np.savez_compressed(path, **{key: value for key, value in arrays.items() if value is not None})
+
+
+def _array_of(field: str) -> str:
+    """What a field of `StudyRows` is called in a file."""
+    return field if field == "anchors_m" else f"row_{field}"
 
 
 REQUIRED = (
@@ -131,6 +144,7 @@ def study_input_from_arrays(arrays: Mapping[str, Any], source: str) -> StudyInpu
         received=received.astype(bool),
         delay_ticks=delay.astype(np.int64),
         truth=check.array("truth", (ticks + 1, n, 6)) if "truth" in arrays else None,
+        rows=check.rows(ticks, n),
     )
 
 
@@ -197,6 +211,48 @@ class _Checker:
         if np.linalg.eigvalsh(value).min() <= 0:
             raise self.fail(key, "a positive definite matrix", f"eigenvalue {np.linalg.eigvalsh(value).min():.3g}")
         return value
+
+    def rows(self, ticks: int, n: int) -> StudyRows | None:
+        version = int(self.number("version", positive=True)) if "version" in self.arrays else 1
+        if version not in (1, 2):
+            raise self.fail("version", "1 or 2", f"{version}")
+        if version == 1:
+            return None
+        count = len(np.atleast_1d(self.numeric("row_tick")))
+        anchors_m = self.numeric("anchors_m")
+        if anchors_m.ndim != 2 or anchors_m.shape[1] != 3:
+            raise self.fail("anchors_m", "shape (m, 3)", f"shape {anchors_m.shape}")
+        kind = self.whole("row_kind", (count,), max(RowKind))
+        lowest = np.where(np.isin(kind, (RowKind.RANGE, RowKind.ANCHOR_RANGE)), 0, -1)
+        highest = np.select([kind == RowKind.RANGE, kind == RowKind.ANCHOR_RANGE], [n - 1, len(anchors_m) - 1], n - 1)
+        body, other = self.whole("row_body", (count,), n - 1), self.whole("row_other", (count,), None, lowest=-1)
+        wrong = (other < lowest) | (other > highest) | ((kind == RowKind.RANGE) & (other == body))
+        if wrong.any():
+            at = int(np.argmax(wrong))
+            expected = "the place of another body (range) or of an anchor (anchor_range)"
+            raise self.fail("row_other", expected, f"{other[at]} in row {at} of kind {kind[at]}")
+        return StudyRows(
+            tick=self.whole("row_tick", (count,), ticks),
+            offset_s=self.array("row_offset_s", (count,)),
+            kind=kind,
+            value=self.array("row_value", (count,)),
+            variance=self.positive("row_variance", (count,)),
+            body=body,
+            other=other,
+            tag=self.whole("row_tag", (count, 2), None),
+            anchors_m=self.array("anchors_m", anchors_m.shape),
+        )
+
+    def whole(self, key: str, shape: tuple[int, ...], most: int | None, *, lowest: int = 0) -> NDArray[np.int64]:
+        """Whole numbers from ``lowest`` to ``most``."""
+        value = self.array(key, shape)
+        beyond = np.zeros(shape, bool) if most is None else value > most
+        bad = (value != np.trunc(value)) | (value < lowest) | beyond
+        if bad.any():
+            where = tuple(int(i) for i in np.argwhere(bad)[0])
+            to = "" if most is None else f" to {most}"
+            raise self.fail(key, f"whole numbers from {lowest}{to}", f"{value[where]:g} at index {where}")
+        return value.astype(np.int64)
 
     def agents(self) -> NDArray[np.int64]:
         value = self.numeric("agents")

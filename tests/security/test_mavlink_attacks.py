@@ -116,6 +116,18 @@ def test_streams_have_stamps_of_their_own() -> None:
     assert len(decoder.feed(late.frame() + early.frame())) == 2
 
 
+def test_links_have_stamps_of_their_own() -> None:
+    # GIVEN one system and component on two links, of which the second is behind by less than a minute
+    decoder = receiver()
+    for link_id, unix_s in ((0, NOW_S), (1, NOW_S - 5.0)):
+        encoder = Encoder(1, 1, LinkSigning(KEY, unix_s=unix_s, link_id=link_id))
+        assert decoder.feed(encoder.encode(heartbeat()))
+    assert refused(decoder) == {}
+    # WHEN the first goes back by as much THEN it is a replay
+    assert not decoder.feed(Encoder(1, 1, LinkSigning(KEY, unix_s=NOW_S - 4.0)).encode(heartbeat()))
+    assert refused(decoder) == {"old stamp": 1}
+
+
 def test_stamps_outlive_a_restart(tmp_path: Path) -> None:
     # GIVEN a link that was used, and its stamps in a file that nobody else can read
     sender, decoder, file = Sender(), receiver(), StampFile(tmp_path / "agent_001.stamps")

@@ -47,5 +47,5 @@ def decode_diagnostics(body: bytes) -> Diagnostics:
     """The diagnostics in a body; raises `Rejected`."""
     try:
         return _DIAGNOSTICS.decode(body)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Rejected(Reason.MALFORMED, str(error)) from None

@@ -193,7 +193,7 @@ class UwbIntake:
 def _decode_json(payload: bytes) -> UwbFrame:
     try:
         frame = _JSON.decode(payload)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Rejected(Reason.MALFORMED, f"uwb JSON: {error}") from None
     if frame.v != 1:
         raise Rejected(Reason.BAD_VERSION, f"uwb-range/{frame.v}, expected 1")

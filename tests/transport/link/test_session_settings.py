@@ -40,6 +40,9 @@ def test_peers_with_explicit_endpoints_and_nothing_that_scouts() -> None:
         "transport/link/tx/lease": 1500,
         "transport/unicast/open_timeout": 1500,
         "transport/unicast/max_links": 1,
+        "transport/unicast/max_sessions": 64,
+        "adminspace/enabled": False,
+        "adminspace/permissions/write": False,
     }.items():
         assert effective(settings, path) == value, path
 

@@ -62,6 +62,7 @@ def test_oversized_reports_are_not_sent() -> None:
     [
         b"",
         b"[" * 100_000,
+        b'{"agent_id": 1, "state": "A", "deep": ' + b"[" * 10_000,
         b'{"agent_id": 1}',
         b'{"agent_id": 1, "state": "\xff"}',
         b'{"agent_id": 1, "state": "A", "gauges": {"a": 1e999}}',

@@ -104,6 +104,7 @@ def test_a_nan_range_is_left_out() -> None:
         (b"", Reason.MALFORMED),
         (b"\xff\xfe\x00", Reason.MALFORMED),
         (b"{" * 10_000, Reason.MALFORMED),
+        (json.dumps(EXAMPLE)[:-1].encode() + b', "deep": ' + b"[" * 10_000, Reason.MALFORMED),
         (b" " * 20_000, Reason.TOO_LONG),
         (json.dumps({**EXAMPLE, "v": 2}).encode(), Reason.BAD_VERSION),
         (json.dumps({**EXAMPLE, "obs": "d3"}).encode(), Reason.MALFORMED),

@@ -12,6 +12,7 @@ from nacl.signing import SigningKey
 
 from transport.errors import KeyFileError, Rejected, SettingsError, UnwritableError
 from transport.security.auth import fingerprint, sign, verify
+from transport.security.key_files import write_text
 from transport.security.keys import (
     add_key,
     init_keys,
@@ -197,3 +198,41 @@ def test_a_spoilt_start_number_is_named(tmp_path: Path) -> None:
         next_boot(path, 1.0)
     with pytest.raises(KeyFileError, match="cannot be written"):
         next_boot(tmp_path / "nowhere" / "boot", 1.0)
+
+
+def test_a_file_planted_where_a_key_is_about_to_be_written_is_not_written_through(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # GIVEN somebody who plants a link right after the temporary file's place was cleared
+    secret, elsewhere = tmp_path / "agent_001.key", tmp_path / "elsewhere"
+    elsewhere.write_text("untouched")
+    cleared = Path.unlink
+
+    def clear_and_plant(path: Path, missing_ok: bool = False) -> None:
+        cleared(path, missing_ok=missing_ok)
+        path.symlink_to(elsewhere)
+
+    monkeypatch.setattr(Path, "unlink", clear_and_plant)
+    with pytest.raises(UnwritableError, match=r"agent_001\.key"):
+        write_text(secret, "secret", 0o600)
+    assert elsewhere.read_text() == "untouched"
+    assert not secret.exists()
+
+
+def test_a_secret_is_private_before_anything_is_in_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    # GIVEN a process that lets everybody read what it makes
+    found: list[tuple[int, int]] = []
+    make_private = os.fchmod
+
+    def look_first(descriptor: int, bits: int) -> None:
+        status = os.fstat(descriptor)
+        found.append((stat.S_IMODE(status.st_mode), status.st_size))
+        make_private(descriptor, bits)
+
+    monkeypatch.setattr(os, "fchmod", look_first)
+    before = os.umask(0)
+    try:
+        write_text(tmp_path / "agent_001.key", "secret", 0o600)
+    finally:
+        os.umask(before)
+    assert found == [(0o600, 0)]

@@ -28,9 +28,14 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.far_field import FarField
-from agent.fleet.lever_arms import has_arms, orientation_measurement
+from agent.fleet.lever_arms import has_arms, orientation_measurement, own_arm
 from agent.fleet.measurement_store import MeasurementStore
-from agent.fleet.measurements import acceleration_measurement, gps_measurements, range_measurement
+from agent.fleet.measurements import (
+    acceleration_measurement,
+    anchor_measurement,
+    gps_measurements,
+    range_measurement,
+)
 from agent.fleet.neighbourhood import rounds_of
 from agent.fleet.neighbours import NeighbourTable
 from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
@@ -85,6 +90,7 @@ class AgentCore:
         self._config = config
         self._agent_id = agent_id
         self._own = config.agent(agent_id)
+        self._places_m = config.places_m
         self._period_s = config.fleet.period_s
         self.layout = Layout(config.ids)
         """Of all who may come: that of the estimates handed out."""
@@ -153,10 +159,16 @@ class AgentCore:
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
         """A range that this agent's module measured."""
-        if sample.observer != self._agent_id or sample.target not in self.layout.agents:
+        anchor_m = self._places_m.get(sample.target)
+        if sample.observer != self._agent_id or (anchor_m is None and sample.target not in self.layout.agents):
             self.counters["range: not ours"] += 1
-        elif self._plausible("range", sample.t_s, now_s):
+        elif not self._plausible("range", sample.t_s, now_s):
+            return
+        elif anchor_m is None:
             self._on_own_record(range_measurement(sample, self._period_s, self._config.sensors))
+        else:
+            arm = own_arm(self._own, sample.tag, self.timeline.orientation_at(sample.t_s))
+            self._on_own_record(anchor_measurement(sample, anchor_m, arm, self._period_s, self._config.sensors))
 
     def on_packet(self, received: Received, now_s: float) -> None:
         """A neighbour's message, opened and checked by the transport."""

@@ -93,7 +93,8 @@ class OnboardAgent:
         datagrams = kind in (LinkKind.UDP_IN, LinkKind.UDP_OUT)
         self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
         antennas = {agent.id: len(agent.uwb_tags_m) for agent in config.agents if agent.uwb_tags_m}
-        self.uwb = UwbAdapter(agent_id, config.ids, config.sensors, antennas)
+        antennas |= dict.fromkeys(config.places_m, 1)
+        self.uwb = UwbAdapter(agent_id, (*config.ids, *config.places_m), config.sensors, antennas)
         shared = shared_settings(config)
         self.opener = Opener(
             config.fleet.name,

@@ -11,6 +11,7 @@ from agent.config.tables import AgentTable, FleetConfig
 from agent.errors import EndpointError
 from estimators.settings import EstimatorSettings
 from transport.link.addresses import MAX_PORT, endpoint_fault, is_host
+from transport.messages.measurement_body import MAX_POSITION_M
 
 IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
 OTHER_BYTES_PER_S = 500
@@ -24,6 +25,7 @@ def faults_between(config: FleetConfig) -> Iterator[Fault]:
     yield from _estimator(config)
     yield from _agents(config)
     yield from _edges(config)
+    yield from _anchors(config)
     yield from _uwb_pairs(config)
     yield from _times(config)
     yield from _radio(config)
@@ -105,11 +107,22 @@ def _baud(config: FleetConfig, key: str, address: str, baud: int) -> Iterator[Fa
         yield Fault(key, expected, found)
 
 
+def _anchors(config: FleetConfig) -> Iterator[Fault]:
+    taken = set(config.ids)
+    for index, anchor in enumerate(config.anchors):
+        key = f"anchors[{index}]"
+        if anchor.id in taken:
+            yield Fault(f"{key}.id", "an id that no drone and no other anchor has", str(anchor.id))
+        taken.add(anchor.id)
+        if not all(abs(component) <= MAX_POSITION_M for component in anchor.position_m):
+            yield Fault(f"{key}.position_m", f"finite, at most {MAX_POSITION_M:g} m", str(list(anchor.position_m)))
+
+
 def _uwb_pairs(config: FleetConfig) -> Iterator[Fault]:
     seen: set[frozenset[int]] = set()
     for index, each in enumerate(config.sensors.uwb_pairs):
         key, pair = f"sensors.uwb_pairs[{index}].pair", frozenset(each.pair)
-        yield from unknown_ids(config, key, each.pair)
+        yield from unknown_ids(config, key, set(each.pair) - config.places_m.keys())
         if len(pair) < 2:
             yield Fault(key, "two different agents", f"{list(each.pair)}")
         if pair in seen:

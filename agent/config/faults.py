@@ -54,9 +54,10 @@ def shown(tables: Any, key: str) -> str:
         if isinstance(step, int):
             text += f", entry {step + 1}"
         elif step.startswith("#"):
-            text = f"agent {step[1:]}" if text == "agents" else f"{text} of agent {step[1:]}"
+            own = text in ("agents", "anchors")
+            text = f"{text[:-1]} {step[1:]}" if own else f"{text} of agent {step[1:]}"
         else:
-            separator = ", " if re.search(r"agent \d+$|entry \d+$", text) else "."
+            separator = ", " if re.search(r"(agent|anchor|entry) \d+$", text) else "."
             text += f"{separator}{step}" if text else step
     return text
 

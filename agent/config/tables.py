@@ -84,6 +84,15 @@ class AgentTable(Table, frozen=True):
     """Zenoh endpoints it dials; absent = those of the agents it hears that have a lower id."""
 
 
+class AnchorTable(Table, frozen=True):
+    """``[[anchors]]``: a UWB module that stands at a known place."""
+
+    id: AgentId
+    """Of the anchor, as drivers and files of ranges name it; no drone has it."""
+    position_m: Point
+    """Of its antenna, NED in the fleet frame."""
+
+
 class MavlinkTable(Table, frozen=True):
     """``[mavlink]``: how the daemon behaves on the autopilot's link."""
 
@@ -239,6 +248,7 @@ class FleetConfig(Table, frozen=True):
 
     fleet: FleetTable
     agents: Annotated[tuple[AgentTable, ...], msgspec.Meta(min_length=1, max_length=999)]
+    anchors: Annotated[tuple[AnchorTable, ...], msgspec.Meta(max_length=999)] = ()
     estimator: EstimatorSettings = msgspec.field(default_factory=default_settings)
     sensors: SensorsTable = msgspec.field(default_factory=SensorsTable)
     initial: InitialTable = msgspec.field(default_factory=InitialTable)
@@ -257,6 +267,11 @@ class FleetConfig(Table, frozen=True):
     def ids(self) -> tuple[int, ...]:
         """Agent ids in the order of the file, which is the order of the state's blocks."""
         return tuple(agent.id for agent in self.agents)
+
+    @property
+    def places_m(self) -> dict[int, Point]:
+        """Where the anchors are, by id."""
+        return {anchor.id: anchor.position_m for anchor in self.anchors}
 
     def agent(self, agent_id: int) -> AgentTable:
         """The table of one agent; raises `KeyError` naming the id if it is not in the fleet."""

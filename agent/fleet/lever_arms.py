@@ -81,6 +81,14 @@ def has_arms(agent: AgentTable) -> bool:
     return any(any(arm) for arm in agent.uwb_tags_m)
 
 
+def own_arm(agent: AgentTable, tag: int, orientation: Orientation | None) -> Shift:
+    """A drone's own arm where it lies as given, for ranges that need no other drone's; unknown without that."""
+    arm = agent.uwb_tags_m[tag] if tag < len(agent.uwb_tags_m) else AT_BODY
+    if orientation is None:
+        return Shift(variance_m2=math.hypot(*arm) ** 2 / 3.0)
+    return Shift(rotated(orientation.quaternion, arm))
+
+
 def tags_of(record: RangeMeasurement) -> tuple[int, int]:
     """The antennas of a range: the observer's, the other's."""
     return (record.tag, record.other_tag) if isinstance(record, TagRangeMeasurement) else (0, 0)

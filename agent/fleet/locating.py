@@ -1,4 +1,4 @@
-"""Where a drone is that has no fixes: its ranges to drones whose places are known, over the last seconds.
+"""Where a drone is that has no fixes: its ranges to drones and anchors whose places are known, over the last seconds.
 
 The places are the agent's own estimates of those drones at the ticks of the ranges, the drone's motion is integrated
 from its accelerations. The place that results is the prior of the drone's block; the ranges that the window still
@@ -7,21 +7,27 @@ holds are not in it.
 
 from __future__ import annotations
 
-from collections import deque
+from collections import Counter, deque
 
 import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import VELOCITY_SIGMA_MPS
-from agent.fleet.lever_arms import LeverArms
+from agent.fleet.lever_arms import LeverArms, Shift
 from agent.fleet.motions import MEMORY_TICKS, Motions
+from agent.sensing.samples import Triple
 from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
 from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
-from transport.messages.measurement_body import Measurement, OrientationMeasurement, RangeMeasurement
+from transport.messages.measurement_body import (
+    AnchorRangeMeasurement,
+    Measurement,
+    OrientationMeasurement,
+    RangeMeasurement,
+)
 
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
@@ -29,8 +35,10 @@ MIN_RANGES = 4
 CORRELATED = 4.0
 """On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
 
-_Known = dict[int, tuple[Vector, Matrix]]
-"""Mean ``(6,)`` and position covariance ``(3, 3)`` by agent."""
+_Place = tuple[Vector, Matrix]
+"""Mean ``(6,)`` and position covariance ``(3, 3)``."""
+_Known = dict[int, _Place]
+"""By agent."""
 
 
 class RangeLocator:
@@ -38,7 +46,7 @@ class RangeLocator:
 
     def __init__(self, config: FleetConfig, motions: Motions) -> None:
         self._period_s = config.fleet.period_s
-        self._ranges: deque[RangeMeasurement] = deque(maxlen=4096)
+        self._ranges: deque[RangeMeasurement | AnchorRangeMeasurement] = deque(maxlen=4096)
         self._motions = motions
         self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
@@ -48,7 +56,7 @@ class RangeLocator:
 
     def note(self, record: Measurement) -> None:
         """Take in a record, own or heard."""
-        if isinstance(record, RangeMeasurement):
+        if isinstance(record, RangeMeasurement | AnchorRangeMeasurement):
             self._ranges.append(record)
         elif isinstance(record, OrientationMeasurement):
             self._arms.note(record)
@@ -74,24 +82,24 @@ class RangeLocator:
 
     def _fit(self, agent_id: int, at_tick: int) -> Place | None:
         usable = [
-            (record, other, self._known[record.tick][other])
+            (record, other, place)
             for record in self._ranges
             if record.tick < at_tick
             and (other := _other_end(record, agent_id)) is not None
-            and other in self._known.get(record.tick, {})
+            and (place := self._place_of(record, other)) is not None
         ]
         usable.sort(key=lambda each: each[0].tick)
         usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
         if len(usable) < MIN_RANGES or at_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)
-        count = dict.fromkeys((other for _, other, _ in usable), 0)
+        count: Counter[int | Triple] = Counter()
         for _, other, _ in usable:
             count[other] += 1
         anchors, leads, shifts, values, variances = [], [], [], [], []
         for record, other, (mean, covariance) in usable:
             back = at_tick - record.tick
-            shift = self._arms.shift(record)
+            shift = self._arms.shift(record) if isinstance(record, RangeMeasurement) else Shift()
             side = 1.0 if record.observer == other else -1.0
             anchors.append(mean[:3] + record.offset_s * mean[3:] + side * np.array(shift.arm_m))
             leads.append(record.offset_s - back * self._period_s)
@@ -103,8 +111,17 @@ class RangeLocator:
         ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
         return multilaterate(ranges, VELOCITY_SIGMA_MPS)
 
+    def _place_of(self, record: RangeMeasurement | AnchorRangeMeasurement, other: int | Triple) -> _Place | None:
+        """The other end of a range at its tick, if that is known."""
+        if isinstance(record, AnchorRangeMeasurement):
+            return np.array((*record.anchor_m, 0.0, 0.0, 0.0)), np.zeros((3, 3))
+        return self._known.get(record.tick, {}).get(record.other if other == record.other else record.observer)
 
-def _other_end(record: RangeMeasurement, agent_id: int) -> int | None:
+
+def _other_end(record: RangeMeasurement | AnchorRangeMeasurement, agent_id: int) -> int | Triple | None:
+    """The agent, or the place of the anchor, at the other end of a range of an agent."""
+    if isinstance(record, AnchorRangeMeasurement):
+        return record.anchor_m if record.observer == agent_id else None
     if record.observer == agent_id:
         return record.other
     return record.observer if record.other == agent_id else None

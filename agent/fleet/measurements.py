@@ -97,6 +97,19 @@ def range_measurement(sample: RangeSample, period_s: float, sensors: SensorsTabl
     return RangeMeasurement(*said)
 
 
+def anchor_measurement(
+    sample: RangeSample, anchor_m: Triple, arm: Shift, period_s: float, sensors: SensorsTable
+) -> AnchorRangeMeasurement:
+    """The record of a range to an anchor at ``anchor_m``, NED: as if the body had measured it.
+
+    The distance from an antenna at p + arm to the anchor is that of p to the anchor less the arm.
+    """
+    said = range_measurement(sample, period_s, sensors)
+    seen = (anchor_m[0] - arm.arm_m[0], anchor_m[1] - arm.arm_m[1], anchor_m[2] - arm.arm_m[2])
+    noise = said.variance_m2 + arm.variance_m2, said.half_width_m
+    return AnchorRangeMeasurement(said.observer, said.tick, seen, said.range_m, *noise, said.offset_s)
+
+
 def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
     """The record of a tick's averaged acceleration."""
     return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)

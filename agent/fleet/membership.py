@@ -31,6 +31,7 @@ from transport.messages.estimate_body import MAX_AGE_TICKS
 from transport.messages.information_body import Information
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
+    AnchorRangeMeasurement,
     Measurement,
     OrientationMeasurement,
     RangeMeasurement,
@@ -67,6 +68,8 @@ class Membership:
         self._heard: dict[int, int] = {}
         self._ranged: dict[tuple[int, int], int] = {}
         """Tick of the last range, by the ids of its ends."""
+        self._anchored: dict[tuple[int, int], int] = {}
+        """Tick of the last range, by the ids of a drone and an anchor."""
         self._joined: dict[int, int] = {}
         self._held: dict[int, int] = {}
         """When the ranges to a drone that is silent itself last held it."""
@@ -104,6 +107,9 @@ class Membership:
             pair = _pair(record.observer, record.other)
             if when > self._ranged.get(pair, -math.inf):
                 self._ranged[pair] = when
+        elif isinstance(record, AnchorRangeMeasurement):
+            self._locator.note(record)
+            self._note_anchor(record, when)
         else:
             self._tracks.note(record)
 
@@ -112,6 +118,14 @@ class Membership:
         for agent in filter(self._is_news, message.agents):
             place, velocity = np.split(message.path[0, block(message.agents.index(agent))], 2)
             self._told[agent] = message.state_tick, self._tracks.prior(place, velocity)
+
+    def _note_anchor(self, record: AnchorRangeMeasurement, when: int) -> None:
+        """A range to an anchor: of those that are known, the nearest to where the record has it, less a lever arm."""
+        known = self._config.anchors
+        if known:
+            nearest = min(known, key=lambda anchor: math.dist(anchor.position_m, record.anchor_m))
+            at = record.observer, nearest.id
+            self._anchored[at] = max(when, self._anchored.get(at, when))
 
     def note_pair(self, message: Information) -> None:
         """A neighbour's pair: what it knows well of drones that are not located here."""
@@ -204,6 +218,11 @@ class Membership:
             (self._places[other], float(tick - min(self._heard.get(other, -math.inf), when)))
             for other in self.located
             if other in self._places and (when := self._ranged.get(_pair(agent, other))) is not None
+        ]
+        near += [
+            (np.array(anchor.position_m), float(tick - when))
+            for anchor in self._config.anchors
+            if (when := self._anchored.get((agent, anchor.id))) is not None
         ]
         places = np.array([place for place, _ in near]).reshape(-1, 3)
         return RangeGeometry.of(self._places[agent], places, np.array([age for _, age in near]))

@@ -240,6 +240,7 @@ class SampleAdapter:
             speed_sigma_mps=message.vel_acc * 1e-3 or GPS_SPEED_SIGMA_MPS,
             fix_type=message.fix_type,
             latency=gps_prior(self.flavour, kind, self._sensors),
+            receiver=receiver.number,
         )
 
     def _fix_time(self, time_usec: int, arrival_s: float, receiver: _HeardReceiver) -> tuple[float | None, Stamp]:

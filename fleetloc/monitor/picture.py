@@ -160,6 +160,7 @@ class FleetPicture:
             links=links,
             alarms=self._alarms(drones, now_s, unix_s),
             refused=dict(self._refusals),
+            anchors=self._config.places_m,
         )
 
     def _drone(self, agent_id: int, now_s: float) -> Drone:

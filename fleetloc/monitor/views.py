@@ -93,6 +93,8 @@ class Picture(View, frozen=True):
     alarms: tuple[Alarm, ...]
     refused: dict[str, int]
     """Packets that the monitor refused since its start, by reason."""
+    anchors: dict[int, Triple] = {}
+    """Where the anchors of the configuration are, by id."""
 
 
 class Tracks(View, frozen=True):

@@ -63,7 +63,7 @@ def _drawn(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) 
 
     return [
         ("Where they were", "Truth pale and wide, each drone's own estimate thin on top; a dot marks the start.",
-         report_plots.trajectories(results)),
+         report_plots.trajectories(config, results)),
         ("Position error and its 3-sigma band",
          "Each drone's error of its own position; the shaded band is what it claims. Grey: its GPS is out.",
          report_plots.errors(config, results)),

@@ -45,7 +45,7 @@ def styled(draw: Drawing[Given]) -> Callable[Given, str]:
 
 
 @styled
-def trajectories(results: FleetResults) -> Figure:
+def trajectories(config: FleetConfig, results: FleetResults) -> Figure:
     """Top view and height over time: the truth pale and wide, what each drone believes of itself thin on top."""
     figure = figure_of(4.6)
     above, beside = figure.subplots(1, 2, gridspec_kw={"width_ratios": (1, 1.25)})
@@ -58,7 +58,10 @@ def trajectories(results: FleetResults) -> Figure:
         when, north, east, down = _columns(track, results, track.own_m)
         above.plot(east, north, color=colour(slot), linewidth=0.9, label=f"drone {track.agent_id}")
         beside.plot(when, -down, color=colour(slot), linewidth=0.9)
-    everything = results.truth.position_m.reshape(-1, 3)
+    places_m = np.array(list(config.places_m.values())).reshape(-1, 3)
+    if len(places_m):
+        above.plot(places_m[:, 1], places_m[:, 0], "k^", markersize=5, label="anchors")
+    everything = np.concatenate([results.truth.position_m.reshape(-1, 3), places_m])
     _frame(above, everything[:, 1], everything[:, 0])
     beside.set_ylim(*span_of(-everything[:, 2]))
     above.set(title="seen from above", xlabel="east m", ylabel="north m")

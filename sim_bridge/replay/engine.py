@@ -10,7 +10,7 @@ from __future__ import annotations
 import functools
 from collections import Counter
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
@@ -59,6 +59,7 @@ class Replay:
         self, config: FleetConfig, feed: Feed, make_estimator: EstimatorFactory, on_estimate: OnEstimate
     ) -> None:
         self._feed = feed
+        self._anchors = config.places_m
         self._inputs = inputs = feed.inputs
         self._queue = EventQueue(inputs.from_s)
         agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
@@ -144,6 +145,8 @@ class Replay:
 
     def _on_range(self, line: RangeLine) -> None:
         """Hand a range to its observer as its UWB module would."""
+        if line.observer in self._anchors:  # it is the drone's module that measures, whoever wrote the file
+            line = replace(line, observer=line.target, target=line.observer, tag=line.other_tag, other_tag=line.tag)
         drone = self.drones.get(line.observer)
         if drone is None or line.observer in self._left:
             self._counts.ranges["observer without a log"] += 1

@@ -77,6 +77,8 @@ class Scenario:
     period_s: float = 0.1
     epoch_unix_s: float = 0.0
     edges: tuple[tuple[int, int], ...] | None = None
+    anchors: tuple[tuple[int, Point], ...] = ()
+    """Ids and places, NED, of modules that all vehicles range."""
     gravity_mps2: float | None = None
     """Absent: normal gravity at the origin."""
     imu_hz: float = 100.0

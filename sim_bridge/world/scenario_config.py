@@ -26,6 +26,7 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         period_s=config.fleet.period_s,
         epoch_unix_s=config.fleet.epoch_unix_s,
         edges=config.fleet.edges,
+        anchors=tuple(config.places_m.items()),
         gravity_mps2=gravity_mps2(config),
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,

@@ -201,19 +201,26 @@ def _wander(noise: GpsNoise, share: float, rng: np.random.Generator) -> GaussMar
 class _Channel:
     """Errors of the ranges between the agents."""
 
-    def __init__(self, noise: UwbNoise, ids: tuple[int, ...], seeds: np.random.SeedSequence) -> None:
+    def __init__(
+        self, noise: UwbNoise, ids: tuple[int, ...], seeds: np.random.SeedSequence, anchors: tuple[int, ...]
+    ) -> None:
         self._noise = noise
         own, *per_agent = seeds.spawn(1 + len(ids))
+        fixed = np.random.default_rng(seeds.spawn(1)[0])
+        self._anchor_bias_m = {(agent, anchor): self._drawn_bias_m(fixed) for agent in ids for anchor in anchors}
         rng = np.random.default_rng(own)
         self._rngs = {agent: np.random.default_rng(seed) for agent, seed in zip(ids, per_agent, strict=True)}
         self.bias_m = {
-            frozenset((a, b)): noise.bias_mean_m
-            + noise.bias_sigma_m * float(rng.standard_normal())
-            + noise.bias_uniform_m * float(rng.uniform(-1.0, 1.0))
+            frozenset((a, b)): self._drawn_bias_m(rng)
             for i, a in enumerate(ids)
             for b in ids[i + 1 :]
         }
         self._phase_rad = {agent: float(rng.uniform(0.0, 2.0 * math.pi)) for agent in ids}
+
+    def _drawn_bias_m(self, rng: np.random.Generator) -> float:
+        noise = self._noise
+        white, even = noise.bias_sigma_m * float(rng.standard_normal()), float(rng.uniform(-1.0, 1.0))
+        return noise.bias_mean_m + white + noise.bias_uniform_m * even
 
     def measure(
         self, observer: int, target: int, true_m: float, bearing_rad: float, fault: RangeError = NO_ERROR
@@ -225,7 +232,8 @@ class _Channel:
         blocked = float(rng.random()) < noise.nlos_probability
         detour = min(float(rng.exponential(noise.nlos_mean_m)), noise.nlos_max_m)
         lobe = noise.orientation_m * math.sin(bearing_rad + self._phase_rad[observer])
-        bias = self.bias_m[frozenset((observer, target))]
+        anchored = self._anchor_bias_m.get((observer, target))
+        bias = self.bias_m[frozenset((observer, target))] if anchored is None else anchored
         error = uniform + white + bias + lobe + (detour if blocked else 0.0) + fault.extra_m
         blocked = blocked or fault.blocked
         rx_dbm = -60.0 - 20.0 * math.log10(max(true_m, 1.0)) - (6.0 if blocked else 0.0)
@@ -279,7 +287,7 @@ class FleetSensors:
         self._gps_grid = _Grid(scenario.gps_hz)
         self._undelivered: deque[tuple[float, int, GpsFix]] = deque()
         uwb = profile.uwb if scenario.uwb_calibrated else uncalibrated(profile.uwb)
-        self._channel = _Channel(uwb, scenario.ids, kinds[4])
+        self._channel = _Channel(uwb, scenario.ids, kinds[4], tuple(anchor for anchor, _ in scenario.anchors))
         cycle_s = 1.0 / scenario.uwb_hz
         self._uwb_grids = [
             _Grid(scenario.uwb_hz, cycle_s * slot / count if scenario.uwb_staggered else 0.0) for slot in range(count)
@@ -421,20 +429,32 @@ class FleetSensors:
             there = self._scenario.slot(target)
             tag, other_tag = self._turn(slot, there)
             between = self._tag_position(there, other_tag) - self._tag_position(slot, tag)
-            north, east, down = (float(axis) for axis in between)
-            distance_m = math.sqrt(north * north + east * east + down * down)
-            if distance_m <= self._scenario.uwb_reach_m:
-                bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
-                fault = self._faults.range_error(observer, target, self._world.time_s)
-                taken = self._channel.measure(observer, target, distance_m, bearing_rad, fault)
+            taken = self._range(slot, target, between)
+            if taken is not None:
                 measured.append(replace(taken, tag=tag, other_tag=other_tag))
+        for anchor, place_m in self._scenario.anchors:
+            tag, _ = self._turn(slot, -anchor)
+            taken = self._range(slot, anchor, np.array(place_m) - self._tag_position(slot, tag))
+            if taken is not None:
+                measured.append(replace(taken, tag=tag))
         return measured
 
+    def _range(self, slot: int, target: int, between: Array) -> SensedRange | None:
+        """What a vehicle's module measures of a body that is ``between`` ``(3,)`` NED away, if it is in reach."""
+        observer = self._scenario.ids[slot]
+        north, east, down = (float(axis) for axis in between)
+        distance_m = math.sqrt(north * north + east * east + down * down)
+        if not distance_m <= self._scenario.uwb_reach_m:  # so that of nowhere, in SITL, nothing is measured
+            return None
+        bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
+        fault = self._faults.range_error(observer, target, self._world.time_s)
+        return self._channel.measure(observer, target, distance_m, bearing_rad, fault)
+
     def _turn(self, slot: int, there: int) -> tuple[int, int]:
-        """Between which antennas the next range is."""
+        """Between which antennas the next range is; anchors, in place of a slot their negative id, have one."""
         turn, own = self._exchanges[slot, there], len(self._tags[slot])
         self._exchanges[slot, there] += 1
-        return turn % own, turn // own % len(self._tags[there])
+        return turn % own, turn // own % (len(self._tags[there]) if there >= 0 else 1)
 
     def _tag_position(self, slot: int, tag: int) -> Array:
         """Where an antenna of a UWB module is, ``(3,)`` NED."""

@@ -141,11 +141,12 @@ function placed() {
 }
 
 function spots() {  // what the view has to hold: [north, east, reach]; uncertainties as far as they are not absurd
-  return placed().flatMap((drone) => {
+  const fixed = Object.values(picture.anchors).map(([north, east]) => [north, east, 0]);
+  return fixed.concat(placed().flatMap((drone) => {
     const own = [...drone.position_m.slice(0, 2), Math.min(drone.ellipse ? drone.ellipse.major_m : 0, 30)];
     if (!isGone(drone) || !drone.seen_by) return [own];
     return [own, [...drone.seen_by.position_m.slice(0, 2), Math.min(3 * drone.seen_by.sigma_m, 5)]];
-  });
+  }));
 }
 
 function fitted(width, height) {
@@ -184,6 +185,11 @@ function drawTop() {
     svg(layer, "polyline", { class: "track", points: path, stroke: colours.get(id) });
   }
   links(layer, x, y);
+  for (const [id, [north, east]] of Object.entries(picture.anchors)) {
+    const at = { x: x(east), y: y(north) };
+    svg(layer, "path", { class: "anchor", d: `M ${at.x} ${at.y - 7} l 7 12 l -14 0 Z`, fill: "currentColor" });
+    svg(layer, "text", { class: "label", x: at.x + 10, y: at.y + 5 }, id);
+  }
   for (const drone of placed()) fromAbove(layer, drone, colours.get(drone.agent_id), x, y);
   map.replaceChildren(layer);
 }

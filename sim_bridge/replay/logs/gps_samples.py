@@ -44,8 +44,13 @@ class ReceiverFix:
     """North and east, where the receiver gives them; surer than speed and course."""
 
 
-def gps_sample(fix: ReceiverFix, frame: FleetFrame, flavour: str, sensors: SensorsTable) -> GpsSample | str:
-    """The sample of a fix stamped with the boot clock of an autopilot ``flavour``, or why there is none."""
+def gps_sample(
+    fix: ReceiverFix, frame: FleetFrame, flavour: str, sensors: SensorsTable, receiver: int = 0
+) -> GpsSample | str:
+    """The sample of a fix stamped with the boot clock of an autopilot ``flavour``, or why there is none.
+
+    ``receiver`` counts the autopilot's receivers from 0.
+    """
     if not sensors.gps_min_fix <= fix.fix_type <= BEST_FIX_TYPE:
         return "gps: no fix"
     place = abs(fix.lat_deg) <= 90.0 and abs(fix.lon_deg) <= 180.0 and (fix.lat_deg or fix.lon_deg)
@@ -69,6 +74,7 @@ def gps_sample(fix: ReceiverFix, frame: FleetFrame, flavour: str, sensors: Senso
         speed_sigma_mps=_known(fix.speed_sigma_mps) or GPS_SPEED_SIGMA_MPS,
         fix_type=fix.fix_type,
         latency=gps_prior(flavour, "boot", sensors),
+        receiver=receiver,
     )
 
 

@@ -12,8 +12,16 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from agent.config.tables import FleetConfig, SensorsTable
+from agent.fleet.lever_arms import Shift
 from agent.fleet.measurement_store import KEEP_TICKS, MeasurementStore
-from agent.fleet.measurements import acceleration_measurement, gps_measurements, inputs_of, range_measurement, rows_of
+from agent.fleet.measurements import (
+    acceleration_measurement,
+    anchor_measurement,
+    gps_measurements,
+    inputs_of,
+    range_measurement,
+    rows_of,
+)
 from agent.sensing.samples import GpsSample, RangeSample
 from agent.sensing.timeline import TickInput
 from estimators.model import measurements
@@ -84,6 +92,19 @@ def test_anchors_and_accelerations_keep_their_numbers() -> None:
     assert (table["tick"][0], table["agent"][0]) == (7, 1)
     with pytest.raises(TypeError, match="not a measurement"):
         rows_of([acceleration_measurement(2, closed)], SLOTS)
+
+
+def test_a_range_to_an_anchor_is_one_of_the_body_to_the_anchor_less_the_arm() -> None:
+    # GIVEN an antenna 0.3 m north of the body, whose range to an anchor is exact
+    arm, body, anchor = Shift((0.3, 0.0, 0.0), 0.01), np.array((1.0, 2.0, -3.0)), (10.0, -4.0, 0.0)
+    range_m = float(np.linalg.norm(body + arm.arm_m - anchor))
+    record = anchor_measurement(RangeSample(10.02, 2, 201, range_m, 0.1), anchor, arm, 0.1, SensorsTable())
+    # THEN the row says the distance of the body from where the record has the anchor, less sure by the arm's variance
+    row = rows_of([record], SLOTS)[0]
+    assert np.linalg.norm(body - [row["x"], row["y"], row["z"]]) == pytest.approx(row["value"], abs=1e-6)
+    assert (row["kind"], row["agent"], row["other"]) == (Kind.ANCHOR_RANGE, 1, -1)
+    assert row["variance"] == pytest.approx(0.02)
+    assert row["offset_s"] == pytest.approx(0.02)
 
 
 def test_no_row_is_surer_than_a_sensor_can_be_whatever_its_record_claims() -> None:

@@ -244,6 +244,13 @@ def test_ranges_of_a_file_reach_their_observer_and_those_of_others_are_counted()
     assert run.counts.agents[2]["skipped uwb not a neighbour"] == 1
 
 
+def test_ranges_to_anchors_reach_the_drone_whichever_end_wrote_them() -> None:
+    lines = [RangeLine(14.0, 9, 1, 15.0, 0.1), RangeLine(14.1, 1, 9, 15.0, 0.1)]
+    run = Run("anchors=[{id=9,position_m=[0,0,0]}]", ranges=lines, to_s=5.0)
+    assert run.counts.ranges == {"delivered": 2}
+    assert run.counts.agents[1]["range: samples"] == 2
+
+
 def test_a_drone_whose_log_ends_is_gone_and_the_others_go_on() -> None:
     logs = (FlightLog(1, seconds=6.0), FlightLog(2), FlightLog(3))
     run = Run(logs=logs)

@@ -231,7 +231,7 @@ class DataflashVehicle:
             down_mps=values.get("VZ"),
             speed_sigma_mps=values.get("SAcc"),
         )
-        sample = gps_sample(fix, self._frame, "ardupilot", self._sensors)
+        sample = gps_sample(fix, self._frame, "ardupilot", self._sensors, values.get("I", 0))
         return sample if isinstance(sample, GpsSample) else self._skip(sample)
 
     # --- the autopilot's estimate ----------------------------------------------------------------------------

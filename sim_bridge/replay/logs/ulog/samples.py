@@ -190,7 +190,7 @@ def _fixes(
             # vel_m_s is the norm with some receivers (DroneCAN, VectorNav), the ground speed with others
             ground_velocity_mps=(row[13], row[14]) if row[15] == 1.0 else None,
         )
-        yield arrival_s, receiver, gps_sample(fix, frame, "px4", sensors)
+        yield arrival_s, receiver, gps_sample(fix, frame, "px4", sensors, receiver)
 
 
 def degrees(table: TopicTable) -> NDArray[np.float64] | None:

@@ -38,8 +38,9 @@ def linearisation_variance(row: np.void, state: Vector, covariance: Matrix, eps:
     away, spread = np.empty(3), np.empty((3, 3))
     a = STATES_PER_AGENT * row["agent"]
     if row["kind"] == _SPEED:
+        shift = (row["x"], row["y"], row["z"])
         for i in range(3):
-            away[i] = state[a + 3 + i]
+            away[i] = state[a + 3 + i] + shift[i]
             for j in range(3):
                 spread[i, j] = covariance[a + 3 + i, a + 3 + j]
     elif row["kind"] == _RANGE or row["kind"] == _ANCHOR_RANGE:

@@ -45,6 +45,11 @@ def test_a_shift_is_as_good_as_a_moved_drone_where_the_linearisation_is_judged()
     found = linearisation_variance(range_row(0, 0, 1, 1.0, 0.01, shift_m=arm)[0], state, covariance, EPS)
     assert found == pytest.approx(linearisation_variance(range_row(0, 0, 1, 1.0, 0.01)[0], moved, covariance, EPS))
     assert found != pytest.approx(linearisation_variance(range_row(0, 0, 1, 1.0, 0.01)[0], state, covariance, EPS))
+    faster = state.copy()
+    faster[3:6] += arm
+    found = linearisation_variance(speed_row(0, 0, 1.0, 0.01, shift_mps=arm)[0], state, covariance, EPS)
+    assert found == pytest.approx(linearisation_variance(speed_row(0, 0, 1.0, 0.01)[0], faster, covariance, EPS))
+    assert found != pytest.approx(linearisation_variance(speed_row(0, 0, 1.0, 0.01)[0], state, covariance, EPS))
 
 
 def test_ranges_between_other_antennas_are_no_repetition() -> None:

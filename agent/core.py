@@ -47,6 +47,7 @@ from agent.sensing.latency import GpsLatency
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.sensing.timeline import TickInput, Timeline, tick_of
 from agent.watch.health import HealthMonitor
+from agent.watch.integrity_watch import IntegrityWatch
 from agent.watch.position_watch import PositionWatch, TickEvidence
 from estimators.estimator import Estimate
 from estimators.integrity.finding import Finding
@@ -101,7 +102,8 @@ class AgentCore:
         self.watch = PositionWatch(config.transport.neighbour_timeout_s)
         self.health = HealthMonitor()
         self.counters: Counter[str] = Counter()
-        self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters)
+        self.integrity = IntegrityWatch(config, agent_id)
+        self.fleet = FleetTracker(config, agent_id, make_estimator, self.counters, self.integrity)
         self.far_field = FarField(config, agent_id, self.counters)
         self._link_state = ""
         """Of the autopilot, for the health; told with every `advance`."""
@@ -384,9 +386,11 @@ class AgentCore:
         whole = in_layout(estimate, present, self.layout)
         if self.far_field.is_on:
             whole = self.far_field.added_to(whole, present)
-        ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time, present)
         message = estimate_message(estimate, present, own)
-        changed = self.health.update(self.watch.observe(self._evidence(estimate, own, now_s)), now_s)
+        found = self.watch.observe(self._evidence(estimate, own, now_s))
+        stated = self.integrity.state(estimate, present, found)
+        ready = EstimateReady(whole, self._tick * self._period_s, now_s, on_time, present, stated)
+        changed = self.health.update(found, now_s)
         if self.fleet.started:
             self.far_field.note_own(estimate, own)
         reports = self.far_field.packet(self._tick)
@@ -398,6 +402,9 @@ class AgentCore:
         self.counters["ticks"] += 1
         self.counters["ticks: late"] += not on_time
         self.counters["ticks: alarm"] += self.health.health.alarm
+        self.counters[f"integrity: {stated.state.lower()}"] += 1
+        for off in stated.off:
+            self.counters[f"integrity: fixes of {off} off"] += 1
         self.counters[f"status: {estimate.status.name.lower()}"] += 1
         self._end_tick()
 
@@ -448,6 +455,7 @@ class AgentCore:
             location=roll.own_location if alone else (),
             contradictions=self._contradictions(estimate),
             timing=self.gps_latency.timing,
+            integrity=self.integrity.observe(estimate, self.fleet.present),
         )
 
     def _contradictions(self, estimate: Estimate) -> tuple[Finding, ...]:

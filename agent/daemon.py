@@ -396,7 +396,8 @@ class Daemon:
             self._tell(observer.on_second, state)
         if self._record is not None:
             self._record.on_second(state)
-        message = diagnostics_of(self._agent_id, state.health, state.counters, state.gauges, state.neighbours)
+        stated = str(self.core.integrity.statement or "")
+        message = diagnostics_of(self._agent_id, state.health, state.counters, state.gauges, state.neighbours, stated)
         self._left_out += len(state.neighbours) - len(message.neighbours)
         self._carry_out(self.onboard.tell(message, time.monotonic()))
 

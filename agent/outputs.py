@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from agent.mavlink.session import LinkState
 from agent.watch.health import Health
 from estimators.estimator import Estimate
+from estimators.integrity.protection.statement import Statement
 from transport.errors import EncodeError
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate
 from transport.security.sealing import Message, Packet
@@ -54,6 +55,8 @@ class EstimateReady:
     ready_s: float
     on_time: bool
     joint: tuple[int, ...] | None = None
+    integrity: Statement | None = None
+    """What is promised of it; absent: nothing, as of estimates that were not made here."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -10,6 +10,7 @@ from typing import Annotated, Literal
 import msgspec
 
 from agent.config.fields import AgentId, Fraction, LeverArm, Name, NotNegative, Point, Positive, Seed, Table
+from agent.config.integrity_table import IntegrityTable
 from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable
 from agent.config.other_tables import OtherTables
 from agent.config.security_table import SecurityTable
@@ -257,6 +258,7 @@ class FleetConfig(Table, frozen=True):
     security: SecurityTable = msgspec.field(default_factory=SecurityTable)
     record: RecordTable = msgspec.field(default_factory=RecordTable)
     health: HealthTable = msgspec.field(default_factory=HealthTable)
+    integrity: IntegrityTable = msgspec.field(default_factory=IntegrityTable)
     metrics: MetricsTable = msgspec.field(default_factory=MetricsTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
     adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)

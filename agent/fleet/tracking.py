@@ -18,6 +18,7 @@ from agent.fleet.fix_tracks import POSITION_SIGMA_M, VELOCITY_SIGMA_MPS
 from agent.fleet.joint_choice import JointChoice
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
+from agent.watch.integrity_watch import IntegrityWatch
 from estimators.consensus.mapping import mapped_path, mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
 from estimators.integrity.innovations import Innovations
@@ -58,16 +59,23 @@ class _Good:
 class FleetTracker:
     """Runs one agent's estimator tick by tick; raises `ESTIMATOR_FAULTS` from `begin`, `mix` and `solve`.
 
-    ``counters`` is where it counts starts, joins, leaves, refused pairs, and moves of the estimate.
+    ``counters`` is where it counts starts, joins, leaves, refused pairs, and moves of the estimate; ``integrity``
+    sees the rows before the estimator does.
     """
 
     def __init__(
-        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, counters: Counter[str]
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        make_estimator: EstimatorFactory,
+        counters: Counter[str],
+        integrity: IntegrityWatch,
     ) -> None:
         self._config = config
         self._agent_id = agent_id
         self._make_estimator = make_estimator
         self._counters = counters
+        self._integrity = integrity
         self._period_s = config.fleet.period_s
         self._estimator: Estimator | None = None
         self._good: _Good | None = None
@@ -115,7 +123,7 @@ class FleetTracker:
             if len(unseen):
                 inputs = np.concatenate((inputs, unseen))
         assert self._estimator is not None
-        self._estimator.begin(tick, rows, inputs)
+        self._estimator.begin(tick, self._integrity.take(tick, self.roll.members, rows), inputs)
         return True
 
     def outgoing(self, tick: int, round_: int) -> Information | WindowStates:

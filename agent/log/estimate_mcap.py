@@ -22,6 +22,7 @@ from mcap.writer import Writer
 
 from agent.errors import LogFileError
 from agent.outputs import EstimateReady
+from estimators.integrity.protection.statement import Statement
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Vector
 from transport.messages.estimate_body import MAX_AGE_TICKS
@@ -53,6 +54,22 @@ class AgentEstimate(msgspec.Struct, frozen=True, omit_defaults=True):
     age_s: float | None = None
 
 
+class Promise(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What an agent promises of its own position (docs/integrity.md); ``off_m``: whose fixes are off, by how much."""
+
+    state: str
+    reason: str
+    protection_horizontal_m: float
+    protection_vertical_m: float
+    off_m: dict[str, float] = {}
+    relative_horizontal_m: dict[str, float] = {}
+    relative_vertical_m: dict[str, float] = {}
+    """Protection levels of the positions of others relative to the own one."""
+    guaranteed_half_axes_m: dict[str, list[float]] = {}
+    """Of the sets that certainly hold those, where there are any."""
+    least_range_m: dict[str, float] = {}
+
+
 class EstimateMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """One message of an estimate channel.
 
@@ -68,6 +85,7 @@ class EstimateMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     on_time: bool
     agents: dict[str, AgentEstimate]
     inputs: int | None = None
+    integrity: Promise | None = None
 
     def arrays(self) -> tuple[Vector, Vector]:
         """Mean and 1-sigma ``(6n,)`` in NED m and m/s, in the order of the file."""
@@ -109,7 +127,28 @@ def estimate_message(
         for slot, agent_id in enumerate(agents)
     }
     return EstimateMessage(
-        estimate.tick, ready.t_s, published_s, int(estimate.status), ready.on_time, known, inputs
+        estimate.tick,
+        ready.t_s,
+        published_s,
+        int(estimate.status),
+        ready.on_time,
+        known,
+        inputs,
+        None if ready.integrity is None else _promise(ready.integrity),
+    )
+
+
+def _promise(stated: Statement) -> Promise:
+    return Promise(
+        str(stated.state),
+        stated.reason,
+        stated.own.horizontal_m,
+        stated.own.vertical_m,
+        {agent_key(each): off_m for each, off_m in stated.off.items()},
+        {agent_key(each): level.horizontal_m for each, level in stated.relative.items()},
+        {agent_key(each): level.vertical_m for each, level in stated.relative.items()},
+        {agent_key(each): held.half_axes_m.tolist() for each, held in stated.guaranteed.items()},
+        {agent_key(each): held.least_range_m for each, held in stated.guaranteed.items()},
     )
 
 
@@ -172,9 +211,7 @@ class EstimateChannels:
         self._epoch_unix_s = epoch_unix_s
         self._estimate_schema = estimate_schema(agents)
 
-    def write(
-        self, agent_id: int, ready: EstimateReady, published_s: float, inputs: int | None = None
-    ) -> None:
+    def write(self, agent_id: int, ready: EstimateReady, published_s: float, inputs: int | None = None) -> None:
         """Append what an agent estimated; ``published_s`` fleet time."""
         message = estimate_message(ready, published_s, self._agents, self._period_s, inputs)
         unix_ns = round((self._epoch_unix_s + published_s) * 1e9)
@@ -228,8 +265,17 @@ def _object(**properties: Any) -> dict[str, Any]:
 
 _NUMBER, _INTEGER = {"type": "number"}, {"type": "integer"}
 _NED = _object(**dict.fromkeys(AXES, _NUMBER))
-_AGENT = _object(
-    position_m=_NED, velocity_mps=_NED, position_sigma_m=_NED, velocity_sigma_mps=_NED, age_s=_NUMBER
+_AGENT = _object(position_m=_NED, velocity_mps=_NED, position_sigma_m=_NED, velocity_sigma_mps=_NED, age_s=_NUMBER)
+_PROMISE = _object(
+    state={"type": "string"},
+    reason={"type": "string"},
+    protection_horizontal_m=_NUMBER,
+    protection_vertical_m=_NUMBER,
+    off_m={"type": "object"},
+    relative_horizontal_m={"type": "object"},
+    relative_vertical_m={"type": "object"},
+    guaranteed_half_axes_m={"type": "object"},
+    least_range_m={"type": "object"},
 )
 _TIME = _object(sec=_INTEGER, nsec=_INTEGER)
 _POSE = _object(
@@ -251,6 +297,7 @@ def estimate_schema(agents: tuple[int, ...]) -> dict[str, Any]:
         status=_INTEGER,
         on_time={"type": "boolean"},
         inputs=_INTEGER,
+        integrity=_PROMISE,
         agents=_object(**{agent_key(agent_id): _AGENT for agent_id in agents}),
     )
     return {"title": ESTIMATE_SCHEMA, **fields}
@@ -264,7 +311,5 @@ def _poses(message: EstimateMessage, epoch_unix_s: float) -> dict[str, Any]:
     return {
         "timestamp": {"sec": sec, "nsec": nsec},
         "frame_id": POSES_FRAME,
-        "poses": [
-            {"position": {"x": p.east, "y": p.north, "z": -p.down}, "orientation": level} for p in places
-        ],
+        "poses": [{"position": {"x": p.east, "y": p.north, "z": -p.down}, "orientation": level} for p in places],
     }

@@ -15,6 +15,7 @@ import numpy as np
 
 from agent.onboard import OnboardAgent
 from agent.watch.health import Health
+from estimators.integrity.protection.statement import IntegrityState
 from estimators.model.measurements import Kind
 from transport.messages.header import MAX_BODY_BYTES, PacketKind
 from transport.messages.report_body import Diagnostics
@@ -124,6 +125,7 @@ def gauges_of(onboard: OnboardAgent, now_s: float) -> dict[str, float]:
         "gps_latency_s": core.gps_latency.latency_s,
         "gps_latency_sigma_s": core.gps_latency.sigma_s,
         **nis_gauges(onboard, onboard.agent_id),
+        **protection_gauges(onboard),
         **rates,
     }
     return {name: value for name, value in gauges.items() if value is not None and math.isfinite(value)}
@@ -135,11 +137,43 @@ def neighbour_gauges(onboard: OnboardAgent, host_s: float, now_s: float) -> dict
     peers = {str(agent_id): peer.as_dict(host_s) for agent_id, peer in opener.peers.items()}
     for agent_id, age_s in core.neighbours.ages_s(now_s).items():
         peers[str(agent_id)]["heard_age_s"] = age_s
+    near = {int(name): gauges for name, gauges in peers.items() if int(name) in core.neighbours}
+    of_pair = nis_gauges, bias_gauges, relative_gauges
+    return {str(each): gauges | _merged(about(onboard, each) for about in of_pair) for each, gauges in near.items()}
+
+
+def _merged(tables: Iterable[dict[str, float]]) -> dict[str, float]:
+    return {name: value for table in tables for name, value in table.items()}
+
+
+def protection_gauges(onboard: OnboardAgent) -> dict[str, float]:
+    """Protection levels of the own position (docs/integrity.md), and whether it is within the alert limits."""
+    stated = onboard.core.integrity.statement
+    if stated is None:
+        return {}
+    alert = stated.state in (IntegrityState.ALERT, IntegrityState.NOT_OBSERVABLE)
     return {
-        agent_id: gauges | nis_gauges(onboard, int(agent_id)) | bias_gauges(onboard, int(agent_id))
-        for agent_id, gauges in peers.items()
-        if int(agent_id) in core.neighbours
+        "protection_horizontal_m": round(stated.own.horizontal_m, 3),
+        "protection_vertical_m": round(stated.own.vertical_m, 3),
+        "integrity_alert": float(alert),
     }
+
+
+def relative_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
+    """Protection levels of a neighbour's relative position, beside them its guaranteed set, and whether it is off."""
+    stated = onboard.core.integrity.statement
+    gauges: dict[str, float] = {}
+    if stated is not None and agent_id in stated.relative:
+        level = stated.relative[agent_id]
+        gauges["protection_horizontal_m"] = round(level.horizontal_m, 3)
+        gauges["protection_vertical_m"] = round(level.vertical_m, 3)
+    if stated is not None and agent_id in stated.guaranteed:
+        held = stated.guaranteed[agent_id]
+        gauges["guaranteed_half_axis_m"] = round(float(held.half_axes_m[0]), 3)
+        gauges["guaranteed_least_range_m"] = round(held.least_range_m, 3)
+    if stated is not None and agent_id in stated.off:
+        gauges["fixes_off_m"] = round(stated.off[agent_id], 3)
+    return gauges
 
 
 def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
@@ -181,10 +215,12 @@ def diagnostics_of(
     counters: dict[str, int],
     gauges: dict[str, float],
     neighbours: dict[str, dict[str, float]],
+    integrity: str = "",
 ) -> Diagnostics:
     """The message that goes out; of very many neighbours the first ones, as many as fit into it."""
     reasons = tuple(reason[:MAX_REASON] for reason in health.reasons)
-    message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges)
+    said = integrity[:MAX_REASON]
+    message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges, integrity=said)
     return msgspec.structs.replace(message, neighbours=_fitting(neighbours, len(msgspec.json.encode(message))))
 
 

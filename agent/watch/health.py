@@ -62,6 +62,8 @@ _TEXTS = {
     What.CONTRADICTORY: "no place explains the measurements",
     What.FIXES_CONTRADICT: "{0.detail} contradict the rest",
     What.FIXES_IGNORED: "{0.detail} contradict the rest, not used",
+    What.RECEIVER_OFF: "{0.detail} off by {0.value:.0f} m, as ranges say",
+    What.SOMEBODY_OFF: "fixes of somebody off, not told whose",
     What.DIVERGED: "estimate of {0.about} outside its guaranteed set",
     What.BOUNDS_BROKEN: "stated bounds broken: {0.detail}",
     What.AUTOPILOT: "autopilot {0.detail}",
@@ -95,6 +97,11 @@ def assess(findings: Iterable[Finding]) -> Health:
     gravest = max((finding.gravity for finding in told), default=Gravity.NOTED)
     alarm = any(finding.gravity is Gravity.ALARM for finding in told)
     return Health(_STATES[gravest], _reasons(told), alarm)
+
+
+def reason_of(finding: Finding) -> str:
+    """One finding in words."""
+    return _TEXTS[finding.what].format(finding.about if finding.what is What.SILENT else finding)
 
 
 def _reasons(findings: list[Finding]) -> tuple[str, ...]:

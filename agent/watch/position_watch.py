@@ -32,6 +32,8 @@ class TickEvidence:
     """What the search for the own place by ranges found, where that is what the start waits for."""
     contradictions: tuple[Finding, ...] = ()
     """Whose fixes the estimator found to contradict the rest, by id, ``None`` for the own ones."""
+    integrity: tuple[Finding, ...] = ()
+    """Whose fixes are off, and what guaranteed sets contradict, about ids, ``None`` for the own drone."""
     timing: FixTiming | None = None
     """Of the latest fix; ``None`` before the first."""
 
@@ -53,6 +55,7 @@ class PositionWatch:
         if evidence.autopilot != CONNECTED:
             found.append(Finding(What.AUTOPILOT, Gravity.DEGRADED, detail=evidence.autopilot))
         found += (replace(each, detail=_fixes_of(each.about)) for each in evidence.contradictions)
+        found += (replace(each, detail=each.detail or _fixes_of(each.about)) for each in evidence.integrity)
         found += self._staleness.observe(evidence.ages)
         if evidence.timing is not None:
             found += self._latency.observe(evidence.timing)

@@ -55,6 +55,10 @@ class What(Enum):
     """A drone's fixes and the rest of what was measured do not fit together."""
     FIXES_IGNORED = auto()
     """A drone's fixes do not fit the rest, and the position has been held without them for a while."""
+    RECEIVER_OFF = auto()
+    """A drone's fixes are shifted: they do not fit the ranges to the others, whose fixes do."""
+    SOMEBODY_OFF = auto()
+    """Somebody's fixes are shifted, and it cannot be told whose."""
     DIVERGED = auto()
     """The estimate of a neighbour's relative position is outside the set that certainly holds it."""
     BOUNDS_BROKEN = auto()

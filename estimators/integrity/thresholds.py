@@ -106,3 +106,18 @@ receiver is dragged away by 0.5 m/s its error is within its covariance after eig
 LATENCY_SHARE = 1.0
 """Error along the track by the latency's sigma, against the sigma of the fix itself, from which on it is what limits
 the fix."""
+
+# --- receivers that are off ---------------------------------------------------------------------------------
+
+NAMED_NATS = 8.0
+"""Odds from which on a receiver is off. In 36 minutes of fleets of three to five with errors that nobody has
+calibrated the highest of a sound one was 7.2, in one look."""
+OVERWHELMING_NATS = 15.0
+"""Odds at which one look is enough; else two in a row have to agree."""
+LEADING_NATS = 5.0
+"""Lead over every other receiver and every pair of ranges, lest the wrong one be named."""
+AGREEING_NATS = 3.0
+AGREEING_S = 10.0
+"""A receiver that is named counts again after odds below `AGREEING_NATS` for so long."""
+FEWEST_RECEIVERS = 4
+"""Of fewer nobody can tell which is off."""

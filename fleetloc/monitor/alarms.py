@@ -50,6 +50,7 @@ def alarms_of_drone(facts: DroneFacts) -> Iterator[Found]:
     if drone.status == "stale":
         yield "stale", "warning", f"no estimate for {drone.estimate_age_s:.1f} s"
     yield from _reasons(facts)
+    yield from _integrity(facts)
     yield from _gps(facts)
     yield from _disagreement(drone)
 
@@ -74,6 +75,16 @@ def _reasons(facts: DroneFacts) -> Iterator[Found]:
         if not any(reason.startswith(said) for reason in reasons):
             level: Level = "bad" if status is Status.NOT_OBSERVABLE else "warning"
             yield said, level, STATUS_TEXTS[status]
+
+
+def _integrity(facts: DroneFacts) -> Iterator[Found]:
+    """An alert of what is promised of the position, where none of the reasons says it already."""
+    diagnostics = facts.diagnostics
+    if diagnostics is None or not diagnostics.integrity.startswith("ALERT: "):
+        return
+    reason = diagnostics.integrity.removeprefix("ALERT: ")
+    if reason not in diagnostics.reasons:
+        yield "integrity", "warning", reason
 
 
 def _level(facts: DroneFacts, number: int, reason: str) -> Level:

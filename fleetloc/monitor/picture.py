@@ -186,6 +186,8 @@ class FleetPicture:
             gps_age_s=None if "gps_age_s" not in gauges else gauges["gps_age_s"] + said_s,
             tick_p99_s=gauges.get("tick_time_p99_s"),
             seen_by=self._seen_by(agent_id, now_s),
+            integrity="" if heard.diagnostics is None else heard.diagnostics.integrity,
+            protection_m=_protection_m(gauges),
         )
 
     def _status(self, heard: _Heard, now_s: float) -> tuple[str, Level]:
@@ -280,6 +282,14 @@ def ellipse_of(covariance: Matrix) -> Ellipse:
         angle_rad=float(np.arctan2(east, north)),
         up_m=float(SIGMAS * np.sqrt(max(covariance[2, 2], 0.0))),
     )
+
+
+def _protection_m(gauges: Mapping[str, float]) -> tuple[float, float] | None:
+    """Horizontal and vertical; ``None`` where the position is as good as unknown."""
+    level = gauges.get("protection_horizontal_m"), gauges.get("protection_vertical_m")
+    if level[0] is None or level[1] is None or level[0] > MAX_PLACED_SIGMA_M:
+        return None
+    return level[0], level[1]
 
 
 def _is_placed(estimate: FleetEstimate, agent_id: int) -> bool:

@@ -18,6 +18,7 @@ COLUMNS = (
     "E m",
     "up m",
     "3 sigma horiz/vert m",
+    "protection m",
     "age s",
     "GPS",
     "hears (age s, loss)",
@@ -41,6 +42,7 @@ def cells(drone: Drone, links: tuple[Link, ...]) -> tuple[str, ...]:
     return (
         *place,
         UNKNOWN if ellipse is None else f"{ellipse.major_m:.2f}/{ellipse.up_m:.2f}",
+        UNKNOWN if drone.protection_m is None else f"{drone.protection_m[0]:.1f}/{drone.protection_m[1]:.1f}",
         _number(age_s, 1.0),
         " ".join(part for part in (drone.gps, _gps_age(drone)) if part) or UNKNOWN,
         ", ".join(heard) or UNKNOWN,
@@ -65,7 +67,7 @@ def table(picture: Picture, where: str) -> RenderableType:
     """The picture for a terminal; ``where`` the web page is."""
     shown = Table(title=f"{picture.fleet}  {_clock(picture.unix_s)} UTC  {where}", title_justify="left")
     for index, column in enumerate(COLUMNS):
-        shown.add_column(column, justify="left" if index in (1, 7, 8) else "right")
+        shown.add_column(column, justify="left" if index in (1, 8, 9) else "right")
     for drone in picture.drones:
         status = Text(drone.status, style=STYLES[drone.level])
         shown.add_row(_label(drone), status, *cells(drone, picture.links))

@@ -57,6 +57,10 @@ class Drone(View, frozen=True):
     gps_age_s: float | None = None
     tick_p99_s: float | None = None
     seen_by: SeenBy | None = None
+    integrity: str = ""
+    """State and reason of what is promised of the position (docs/integrity.md)."""
+    protection_m: tuple[float, float] | None = None
+    """Protection levels, horizontal and vertical."""
 
 
 class Link(View, frozen=True):

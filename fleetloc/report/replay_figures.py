@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -52,9 +53,7 @@ def load_results(prepared: Prepared, directory: Path) -> ReplayResults:
         record = run_files.record_path(directory, agent_id)
         first_s[agent_id] = first_estimate_s(record, layout, agent_id)
         phases[agent_id] = _phases(prepared, first_s[agent_id])
-        compared[agent_id] = compare(
-            record, layout, agent_id, references, phases[agent_id], config.fleet.period_s
-        )
+        compared[agent_id] = compare(record, layout, agent_id, references, phases[agent_id], config.fleet.period_s)
     return ReplayResults(compared, references, phases, first_s)
 
 
@@ -112,9 +111,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResult
             "left_out_s": counts.left_out_s,
             "ranges": dict(counts.ranges) | _range_lines(prepared) | _synthetic(prepared),
             "truth_lines_skipped": {
-                str(agent_id): dict(file.skipped)
-                for agent_id, file in prepared.truth_files.items()
-                if file.skipped
+                str(agent_id): dict(file.skipped) for agent_id, file in prepared.truth_files.items() if file.skipped
             },
         },
         "logs": [_of_log(source, names[source.path]) for source in prepared.sources],
@@ -155,11 +152,20 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
             for phase in results.phases[agent_id]
         },
         "ticks_alarm": counters["ticks: alarm"],
+        "integrity": of_integrity(counters),
         "fit": replayed.fit[agent_id].figures(),
         "packets": counted_packets(counters),
         "sensors": sensors,
         "counters": dict(sorted(counters.items())),
     }
+
+
+def of_integrity(counters: Mapping[str, int]) -> dict[str, Any]:
+    """Ticks in each state, and ticks in which fixes were found to be off, by the id of their drone."""
+    begin = "integrity: "
+    told = {name.removeprefix(begin): count for name, count in counters.items() if name.startswith(begin)}
+    off = {name.split()[2]: count for name, count in told.items() if name.startswith("fixes of ")}
+    return {"ticks": {name: count for name, count in told.items() if " of " not in name}, "ticks_fixes_off": off}
 
 
 def _of_errors(errors: Errors) -> dict[str, Any]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,7 +19,17 @@ STALE_S = 1.0
 """An estimate older than this is shown as a silence."""
 FIX_NAMES = {0: "no GPS", 1: "no fix", 2: "2-D", 3: "3-D", 4: "DGPS", 5: "RTK float", 6: "RTK fixed"}
 STYLES = {"ok": "green", "degraded": "yellow", "aligning": "cyan", "init": "cyan", "fault": "red"}
-COLUMNS = ("drone", "status", "error m", "sigma m", "GPS", "heard (age s)", "tick p50/p99 ms", "packets rx/lost/bad")
+COLUMNS = (
+    "drone",
+    "status",
+    "error m",
+    "sigma m",
+    "protection m",
+    "GPS",
+    "heard (age s)",
+    "tick p50/p99 ms",
+    "packets rx/lost/bad",
+)
 
 
 @dataclass(frozen=True, slots=True)
@@ -30,6 +41,7 @@ class Row:
     style: str
     error: str
     sigma: str
+    protection: str
     gps: str
     neighbours: str
     tick: str
@@ -37,7 +49,7 @@ class Row:
 
     def cells(self) -> tuple[str, ...]:
         """The cells after the status."""
-        return self.error, self.sigma, self.gps, self.neighbours, self.tick, self.packets
+        return self.error, self.sigma, self.protection, self.gps, self.neighbours, self.tick, self.packets
 
 
 def rows(
@@ -57,7 +69,7 @@ def _row(
     error, sigma = _accuracy(config, agent_id, observed, truth, now_s)
     diagnostics = observed.diagnostics
     if diagnostics is None:
-        return Row(agent_id, status, style, error, sigma, "", "", "", "")
+        return Row(agent_id, status, style, error, sigma, "", "", "", "", "")
     gauges, counters = diagnostics.gauges, diagnostics.counters
     fix = int(gauges.get("gps_fix_type", 0.0))
     heard = (
@@ -72,11 +84,22 @@ def _row(
         style,
         error,
         sigma,
+        protection_text(gauges),
         gps=f"{FIX_NAMES.get(fix, fix)} {gauges['gps_age_s']:.1f} s" if "gps_age_s" in gauges else "none yet",
         neighbours=", ".join(heard) or "nobody",
         tick=f"{1e3 * gauges.get('tick_time_p50_s', 0.0):.1f}/{1e3 * gauges.get('tick_time_p99_s', 0.0):.1f}",
         packets=f"{counters.get('packets received', 0)}/{counters.get('packets lost', 0)}/{bad}",
     )
+
+
+def protection_text(gauges: Mapping[str, float]) -> str:
+    """Protection levels, horizontal and vertical, m; marked where they, or what else is found, are an alert."""
+    names = "protection_horizontal_m", "protection_vertical_m"
+    if not all(name in gauges for name in names):
+        return ""
+    horizontal_m, vertical_m = (gauges[name] for name in names)
+    alert = "!" if gauges.get("integrity_alert") else ""
+    return f"{horizontal_m:.1f}/{vertical_m:.1f}{alert}" if horizontal_m < 1e3 else f"unknown{alert}"
 
 
 def _status(observed: Observed, ended: str | None, now_s: float) -> tuple[str, str]:
@@ -111,7 +134,7 @@ def table(title: str, picture: list[Row]) -> Table:
     """The picture for a terminal."""
     shown = Table(title=title, title_justify="left")
     for index, column in enumerate(COLUMNS):
-        shown.add_column(column, justify="left" if index in (1, 4, 5) else "right")
+        shown.add_column(column, justify="left" if index in (1, 5, 6) else "right")
     for row in picture:
         shown.add_row(str(row.agent_id), Text(row.status, style=row.style), *row.cells())
     return shown
@@ -120,7 +143,8 @@ def table(title: str, picture: list[Row]) -> Table:
 def lines(title: str, picture: list[Row]) -> list[str]:
     """The picture for a log."""
     return [title] + [
-        f"  drone {row.agent_id}: {row.status}; error {row.error or '?'} m, sigma {row.sigma or '?'} m; "
+        f"  drone {row.agent_id}: {row.status}; error {row.error or '?'} m, sigma {row.sigma or '?'} m, "
+        f"protection {row.protection or '?'} m; "
         f"GPS {row.gps or '?'}; hears {row.neighbours or '?'}; tick p50/p99 {row.tick or '?'} ms; "
         f"packets rx/lost/bad {row.packets or '?'}"
         for row in picture

@@ -10,10 +10,11 @@ from tests.support.loopback_sitl import FRAME
 
 
 def fleet_config(*, ids: tuple[int, ...] = (1, 2, 3), **tables: Any) -> FleetConfig:
-    """Agents out of 1 (PX4), 2 (ArduPilot), 3 (PX4); ``tables`` are further ones of the document."""
+    """Agents 1 (PX4), 2 (ArduPilot), 3 (PX4), others of either; ``tables`` are further ones of the document."""
     flavours = {1: "px4", 2: "ardupilot", 3: "px4"}
     entries = [
-        {"id": agent, "autopilot": flavours[agent], "mavlink": f"udpin:127.0.0.1:{14650 + agent}"} for agent in ids
+        {"id": agent, "autopilot": flavours.get(agent, "auto"), "mavlink": f"udpin:127.0.0.1:{14650 + agent}"}
+        for agent in ids
     ]
     return config_from(
         {

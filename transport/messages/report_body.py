@@ -25,6 +25,8 @@ class Diagnostics(msgspec.Struct, frozen=True, omit_defaults=True):
     counters: Annotated[dict[Name, int], msgspec.Meta(max_length=256)] = {}
     gauges: Annotated[dict[Name, float], msgspec.Meta(max_length=256)] = {}
     neighbours: Annotated[dict[Name, dict[Name, float]], msgspec.Meta(max_length=256)] = {}
+    integrity: Text = ""
+    """State and reason of what is promised of the own position (docs/integrity.md)."""
 
 
 _DIAGNOSTICS = msgspec.json.Decoder(Diagnostics)

@@ -224,7 +224,9 @@ class SetBank:
             (moved, slack), (other_moved, other_slack) = mine.since(age), other.since(age)
             width = float(half[each]) + float(np.linalg.norm(slack + other_slack))
             if math.isfinite(width):
-                found[kept] = rows["value"][each], width, *(other_moved - moved)
+                arms = np.array([rows[axis][each] for axis in "xyz"])  # of the antennas, from the one's end
+                arms = arms if rows["agent"][each] == own else -arms
+                found[kept] = rows["value"][each], width, *(other_moved - moved + arms)
                 kept += 1
         return found[:kept]
 

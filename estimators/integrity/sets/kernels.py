@@ -195,7 +195,9 @@ def nearest_distance(c: Vector, p: Matrix) -> float:
     if not _level(c, p, low, x) > 1.0:
         return 0.0
     high = max(distance * np.sqrt(trace), low) * 2.0 + trace
-    while _level(c, p, high, x) > 1.0:
+    for _ in range(BISECTIONS):
+        if not _level(c, p, high, x) > 1.0:
+            break
         high *= 4.0
     for _ in range(BISECTIONS):
         middle = np.sqrt(low * high)

@@ -104,6 +104,7 @@ function showDrones() {
     cell(row, place ? number(place[1], 1) : "–");
     cell(row, place ? number(-place[2], 1) : "–");
     cell(row, drone.ellipse ? `${short(drone.ellipse.major_m)} / ${short(drone.ellipse.up_m)}` : "–");
+    cell(row, drone.protection_m ? `${short(drone.protection_m[0])} / ${short(drone.protection_m[1])}` : "–");
     cell(row, number(drone.estimate_age_s, 1), isGone(drone) ? drone.level : "");
     cell(row, known(drone.gps_age_s) ? `${drone.gps} ${short(drone.gps_age_s)} s` : drone.gps || "–",
       known(drone.gps_age_s) && drone.gps_age_s > 3 ? "warning" : "");

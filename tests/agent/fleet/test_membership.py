@@ -13,6 +13,7 @@ from agent.config.tables import FleetConfig
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership, is_absent
 from agent.fleet.tracking import ABSENT_VARIANCE, FleetTracker, in_layout
+from agent.watch.integrity_watch import IntegrityWatch
 from estimators.estimator import Estimate, Status
 from estimators.factory import make_estimator
 from estimators.integrity.finding import What, has
@@ -51,7 +52,7 @@ class Agent:
     def __init__(self, config: FleetConfig) -> None:
         self.store = MeasurementStore(config, 1)
         self.counters: Counter[str] = Counter()
-        self.tracker = FleetTracker(config, 1, make_estimator, self.counters)
+        self.tracker = FleetTracker(config, 1, make_estimator, self.counters, IntegrityWatch(config, 1))
         self.config = config
         self.tick = 0
 

@@ -290,7 +290,7 @@ def test_a_drone_that_only_others_report_of_is_shown_with_its_age_until_its_flee
     assert later.seen_by.position_m == pytest.approx((103.4, 20.0, -30.0))
     assert math.hypot(*sigmas) < seen.sigma_m < later.seen_by.sigma_m
     assert later.position_m is None
-    north, _, up, *_, age_s = table.cells(later, ())[:5]
+    north, _, up, *_, age_s = table.cells(later, ())[:6]
     assert (north, up, age_s) == ("103.4", "30.0", "1.7")
     # WHEN nothing more comes for as long as a drone is kept
     assert drone(picture.at(50.0 + 9.2, UNIX_S), 3).seen_by is not None
@@ -307,3 +307,20 @@ def test_a_report_of_the_future_does_not_stand_for_good() -> None:
     seen = drone(picture.at(later_s, UNIX_S), 3).seen_by
     assert seen is not None
     assert seen.position_m[0] == pytest.approx(7.0)
+
+
+def test_what_is_promised_is_shown_and_an_alert_is_an_alarm() -> None:
+    flight = Flight(fleet())
+    said = "horizontal protection level 5.2 m above 4 m"
+    gauges = {"protection_horizontal_m": 5.2, "protection_vertical_m": 3.1, "integrity_alert": 1.0}
+    flight.reports[2] = {"gauges": gauges, "integrity": f"ALERT: {said}"}
+    flight.reports[3] = {"gauges": {"protection_horizontal_m": 4e4, "protection_vertical_m": 4e4}}
+    shown = flight.fly(2.0)
+    assert drone(shown, 2).protection_m == (5.2, 3.1)
+    assert drone(shown, 2).integrity == f"ALERT: {said}"
+    assert [alarm.text for alarm in alarms(shown, 2)] == [said]
+    assert drone(shown, 3).protection_m is None  # as good as unknown
+    assert "5.2/3.1" in table.cells(drone(shown, 2), shown.links)
+    # a reason that the drone gives itself is not told twice
+    flight.reports[2] = {"gauges": gauges, "integrity": "ALERT: not observable", "reasons": ("not observable",)}
+    assert [alarm.text for alarm in alarms(flight.fly(2.0), 2)].count("not observable") == 1

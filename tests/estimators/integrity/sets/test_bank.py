@@ -48,9 +48,12 @@ def rows_of(tick: int, rng: np.random.Generator, shift: Vector | None = None) ->
         for other in range(slot + 1, 3):
             late = tick - int(rng.integers(0, 3))
             t_s = late * PERIOD_S + offset_s
-            true_m = float(np.linalg.norm(place(slot, t_s) - place(other, t_s)))
+            ends = (slot, other) if rng.random() < 0.5 else (other, slot)
+            arms = rng.uniform(-1.0, 1.0, 3)  # of the antennas
+            true_m = float(np.linalg.norm(place(ends[0], t_s) - place(ends[1], t_s) + arms))
             range_m = true_m + RANGE_M * float(rng.choice((-1.0, 1.0)))
-            rows.append(row(late, offset_s, range_m, Kind.RANGE, slot, other=other))
+            ranged = row(late, offset_s, range_m, Kind.RANGE, ends[0], other=ends[1])
+            rows.append((*ranged[:5], *arms.tolist(), *ranged[8:]))
     return np.array(rows, ROW)
 
 

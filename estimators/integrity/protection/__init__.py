@@ -1,0 +1,1 @@
+"""What is promised of a position besides the estimate: `levels` of protection, and the `statement` of a tick."""

@@ -1,0 +1,83 @@
+"""What an agent promises: whose rows it leaves out, what it states of an estimate."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agent.config.integrity_table import IntegrityTable
+from agent.watch.integrity_watch import IntegrityWatch, bounds_of
+from estimators.estimator import Estimate, Status
+from estimators.integrity.finding import What, has
+from estimators.integrity.protection.statement import ALIKE, IntegrityState
+from estimators.model.measurements import Kind
+from tests.support.sitl_fleet import fleet_config
+from tests.support.uncalibrated_fleet import jump, rows_of_flight
+
+IDS = (1, 2, 3, 4, 5)
+NAMED = 3
+
+
+def watch(own: int = 1, *, exclude: bool = True) -> tuple[IntegrityWatch, int]:
+    """That of a fleet of five after a receiver has jumped by 30 m, and the tick."""
+    config = fleet_config(ids=IDS, integrity={"exclude": exclude, "position_bound_m": 5.0, "range_bound_m": 2.0})
+    made, tick = IntegrityWatch(config, own), 0
+    for tick, rows in rows_of_flight(5, 3, 24.0, jump(NAMED - 1, np.array([30.0, 20.0, 0.0]), 20.0, 99.0)):
+        made.take(tick, IDS, rows)
+    return made, tick
+
+
+def estimate(tick: int, sigma_m: float = 0.3) -> Estimate:
+    mean = np.zeros(30)
+    mean[::6] = 10.0 * np.arange(5)
+    return Estimate(tick, mean, sigma_m**2 * np.eye(30), Status.OK, np.zeros(5, np.int64))
+
+
+@pytest.mark.parametrize("exclude", [True, False])
+def test_fixes_that_are_off_do_not_reach_the_estimator(exclude: bool) -> None:
+    made, tick = watch(exclude=exclude)
+    rows = next(rows_of_flight(5, 3, 0.1))[1]
+    rows["tick"] = tick + 1
+    left = made.take(tick + 1, IDS, rows)
+    off = (rows["kind"] == Kind.POSITION) & (rows["agent"] == NAMED - 1)
+    assert off.any()
+    np.testing.assert_array_equal(left, rows[~off] if exclude else rows)
+
+
+@pytest.mark.parametrize(("own", "about"), [(1, NAMED), (NAMED, None)])
+def test_everybody_names_the_same_drone_and_it_itself(own: int, about: int | None) -> None:
+    made, tick = watch(own)
+    (found,) = (each for each in made.observe(estimate(tick), IDS) if each.what is What.RECEIVER_OFF)
+    assert found.about == about
+    stated = made.state(estimate(tick), IDS, (found,))
+    assert stated.state is IntegrityState.DEGRADED
+    assert list(stated.off) == [NAMED]
+    assert stated.off[NAMED] == pytest.approx(36.0, abs=15.0)  # to the first order in 30 m over 10 m
+    assert "as ranges say" in str(stated)
+    assert stated.undetectable == (ALIKE,)
+    assert set(stated.relative) == set(IDS) - {own}
+    assert made.statement is stated
+
+
+def test_an_uncertain_position_is_an_alert_by_the_configured_limits() -> None:
+    made = IntegrityWatch(fleet_config(ids=IDS, integrity={"alert_horizontal_m": 2.0}), 1)
+    assert made.state(estimate(0, 0.5), IDS, ()).state is IntegrityState.NOMINAL
+    stated = made.state(estimate(0, 0.6), IDS, ())
+    assert stated.state is IntegrityState.ALERT
+    assert stated.reason == "horizontal protection level 2.2 m above 2 m"
+
+
+def test_an_estimate_of_another_tick_is_held_against_nothing() -> None:
+    made, tick = watch()
+    assert not has(made.observe(estimate(tick + 1), IDS), What.RECEIVER_OFF)
+
+
+def test_bounds_come_from_the_configuration() -> None:
+    nothing = bounds_of(IntegrityTable(), None)
+    assert all(math.isinf(each) for each in (*nothing.position_m, nothing.range_m, nothing.speed_mps))
+    stated = bounds_of(IntegrityTable(position_bound_m=2.0, height_bound_m=3.0, velocity_bound_mps=0.5), 9.0)
+    assert stated.position_m == (2.0, 2.0, 3.0)
+    assert (stated.velocity_mps, stated.speed_mps) == (0.5, 9.0)
+    assert bounds_of(IntegrityTable(position_bound_m=2.0), None).position_m == (2.0, 2.0, 2.0)

@@ -1,0 +1,122 @@
+"""Who is named when a receiver is off, when, and who never is.
+
+``FLEETLOC_NAMING_SEEDS`` sets how many flights there are of each ramp.
+"""
+
+from __future__ import annotations
+
+import os
+
+import numpy as np
+import pytest
+
+from estimators.integrity.exclusion.baselines import SharedTick
+from estimators.integrity.exclusion.naming import NamingMonitor
+from estimators.integrity.finding import What, has
+from estimators.model.measurements import Kind
+from tests.support.uncalibrated_fleet import PERIOD_S, Shift, jump, no_shift, ramp, rows_of_flight
+
+BEGUN_S = 30.0
+SEEDS = int(os.environ.get("FLEETLOC_NAMING_SEEDS", "2"))
+
+
+def flown(
+    drones: int, seed: int, duration_s: float, shift: Shift = no_shift, *, calibrated: bool = False
+) -> tuple[NamingMonitor, list[tuple[float, set[int]]]]:
+    """The monitor at the end, and each change of whom it names: instant and ids (slot + 1)."""
+    monitor, changes = NamingMonitor(1, PERIOD_S), [(0.0, set[int]())]
+    ids = tuple(range(1, drones + 1))
+    for tick, rows in rows_of_flight(drones, seed, duration_s, shift, calibrated=calibrated):
+        found = monitor.observe(SharedTick(tick, ids, rows))
+        named = {each.about for each in found if each.what is What.RECEIVER_OFF and each.about is not None}
+        assert named == set(monitor.named)
+        if named != changes[-1][1]:
+            changes.append((tick * PERIOD_S, named))
+    return monitor, changes[1:]
+
+
+@pytest.mark.parametrize("drones", [3, 4, 5])
+@pytest.mark.parametrize("calibrated", [True, False])
+def test_nobody_is_named_where_nobody_is_off(drones: int, calibrated: bool) -> None:
+    for seed in range(2):
+        monitor, changes = flown(drones, seed, 45.0, calibrated=calibrated)
+        assert changes == []
+        assert monitor.unattributable_nats == 0.0
+        assert monitor.receivers == drones
+
+
+@pytest.mark.parametrize(("rate_mps", "within_s"), [(5.0, 2.5), (0.5, 13.0), (0.1, 70.0)])
+@pytest.mark.parametrize("seed", range(SEEDS))
+def test_a_receiver_that_is_dragged_away_is_named(rate_mps: float, within_s: float, seed: int) -> None:
+    slot = seed % 5
+    _, changes = flown(5, seed, BEGUN_S + within_s + 1.0, ramp(slot, rate_mps, BEGUN_S, seed))
+    (named,) = changes
+    assert named[1] == {slot + 1}
+    assert 0.0 < named[0] - BEGUN_S <= within_s
+
+
+def test_a_jump_is_named_within_a_second_or_so_and_taken_back_after_ten_that_agree() -> None:
+    _, (named, taken_back) = flown(5, 3, 50.0, jump(2, np.array([30.0, 20.0, 0.0]), 20.0, 25.0))
+    assert named[1] == {3}
+    assert named[0] <= 21.5
+    assert taken_back[1] == set()
+    assert 10.0 <= taken_back[0] - 25.0 <= 13.0
+
+
+def test_how_far_it_is_off_is_told() -> None:
+    monitor, _ = flown(5, 1, 26.0, jump(2, np.array([12.0, -9.0, 0.0]), 20.0, 99.0))
+    # the height is poorly seen: all drones are within a few metres of one
+    np.testing.assert_allclose(monitor.named[3].shift_m[:2], [12.0, -9.0], atol=4.0)
+
+
+def test_of_three_it_is_seen_that_one_is_off_and_not_told_whose() -> None:
+    monitor, changes = flown(3, 1, 26.0, jump(1, np.array([20.0, 0.0, 0.0]), 20.0, 99.0))
+    assert changes == []
+    assert monitor.unattributable_nats > 0.0
+    found = monitor.observe(SharedTick(260, (1, 2, 3), next(rows_of_flight(3, 1, 0.1))[1][:0]))
+    assert has(found, What.SOMEBODY_OFF)
+
+
+def test_all_that_are_off_alike_cannot_be_seen() -> None:
+    monitor, changes = flown(5, 2, 40.0, lambda t_s, _: np.array([5.0, 0.0, 0.0]) * max(0.0, t_s - 20.0))
+    assert changes == []
+    assert monitor.unattributable_nats == 0.0
+
+
+def test_two_are_named_one_after_the_other() -> None:
+    first, second = jump(0, np.array([25.0, 0.0, 0.0]), 15.0, 99.0), jump(3, np.array([0.0, 25.0, 0.0]), 25.0, 99.0)
+    _, changes = flown(6, 4, 32.0, lambda t_s, slot: first(t_s, slot) + second(t_s, slot))
+    assert [named for _, named in changes] == [{1}, {1, 4}]
+
+
+def test_a_pair_whose_ranges_are_off_names_no_receiver() -> None:
+    monitor = NamingMonitor(1, PERIOD_S)
+    for tick, rows in rows_of_flight(5, 6, 40.0):
+        stuck = (rows["kind"] == Kind.RANGE) & (rows["agent"] == 1) & (rows["other"] == 3) & (tick > 200)
+        rows["value"][stuck] += 8.0
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+    assert monitor.named == {}
+
+
+def test_a_member_that_says_it_is_nowhere_harms_nobody_else() -> None:
+    monitor = NamingMonitor(1, PERIOD_S)
+    for tick, rows in rows_of_flight(5, 3, 25.0):
+        said = (rows["kind"] == Kind.POSITION) & (rows["agent"] == 3) & (tick > 100)
+        rows["value"][said] = 1e300
+        with np.errstate(over="ignore", invalid="ignore"):
+            found = monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+        assert {each.about for each in found} <= {4}
+        assert np.isfinite(monitor.separation_m).all()
+
+
+def test_late_rows_and_those_who_leave_do_no_harm() -> None:
+    monitor = NamingMonitor(1, PERIOD_S)
+    shift = jump(2, np.array([30.0, 0.0, 0.0]), 20.0, 99.0)
+    for tick, rows in rows_of_flight(5, 3, 30.0, shift):
+        monitor.observe(SharedTick(tick + 1, (1, 2, 3, 4, 5), rows))  # everything a tick late
+    assert set(monitor.named) == {3}
+    rest = rows[(rows["agent"] != 2) & (rows["other"] != 2)]
+    rest["agent"] -= rest["agent"] > 2
+    rest["other"] -= rest["other"] > 2
+    monitor.observe(SharedTick(301, (1, 2, 4, 5), rest))
+    assert monitor.named == {}

@@ -54,7 +54,7 @@ from estimators.integrity.finding import Finding
 from estimators.integrity.solution import Solution
 from estimators.integrity.staleness import Ages, gps_lost
 from estimators.integrity.thresholds import GPS_LOST_S
-from estimators.model.layout import Layout, block
+from estimators.model.layout import block
 from transport.link.rounds import RoundBarrier
 from transport.messages.far_body import FarReports
 from transport.messages.information_body import Information
@@ -93,7 +93,7 @@ class AgentCore:
         self._own = config.agent(agent_id)
         self._places_m = config.places_m
         self._period_s = config.fleet.period_s
-        self.layout = Layout(config.ids)
+        self.layout = config.layout
         """Of all who may come: that of the estimates handed out."""
         self.timeline = timeline
         self.gps_latency = GpsLatency(self._period_s, config.sensors)

@@ -94,13 +94,14 @@ class OnboardAgent:
         self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
         antennas = {agent.id: len(agent.uwb_tags_m) for agent in config.agents if agent.uwb_tags_m}
         antennas |= dict.fromkeys(config.places_m, 1)
-        self.uwb = UwbAdapter(agent_id, (*config.ids, *config.places_m), config.sensors, antennas)
+        self.uwb = UwbAdapter(agent_id, (*config.bodies, *config.places_m), config.sensors, antennas)
         shared = shared_settings(config)
         self.opener = Opener(
             config.fleet.name,
             config.ids,
             identity.trust,
             own_id=agent_id,
+            bodies=config.bodies,
             freshness_s=config.security.freshness_s,
             agreement=None if recorded else agreement_hash(shared),
             recorded=recorded,

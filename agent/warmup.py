@@ -18,7 +18,7 @@ def warm_up(config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory
 
     What goes wrong here is left to the real one, which is watched and reported.
     """
-    layout = Layout(config.ids)
+    layout = config.layout
     slot = layout.slot(agent_id)
     mean = np.zeros(layout.dimension)
     for other in range(layout.size):

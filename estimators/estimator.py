@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from estimators.integrity.finding import Finding
 from estimators.integrity.innovations import Innovations
 from estimators.model.gaussian import Prior
-from estimators.model.layout import Layout
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.systematic.range_biases import RangeBiases
 
@@ -162,13 +162,15 @@ class Estimator(Protocol):
         """The estimate of the tick, with at most ``budget`` iterations where the method iterates."""
         ...
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """Let agents join and leave, between two ticks (after ``solve``, before ``begin``).
 
         ``agents`` are the ids of the new fleet in the order of their blocks, ``own`` among them. Those in ``fresh``
         begin with a prior at ``prior_tick``, uncorrelated with the rest, also if they were there before; all others
-        keep their block. Rows that name a removed or replaced agent are dropped. Raises ``KeyError`` for an agent
-        that is neither old nor fresh, and ``numpy.linalg.LinAlgError`` where the old information is singular; then
-        the estimator is of no use any more.
+        keep their block. ``kinds`` says who is no vehicle. Rows that name a removed or replaced agent are dropped.
+        Raises ``KeyError`` for an agent that is neither old nor fresh, and ``numpy.linalg.LinAlgError`` where the old
+        information is singular; then the estimator is of no use any more.
         """
         ...

@@ -59,11 +59,27 @@ class VehicleLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Highest speed, over all axes; absent = none."""
 
 
+class TargetLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """Between which altitudes targets are, above the fleet's origin.
+
+    For ranges from a flat fleet a target has a mirror image above it; a ceiling below the fleet leaves one place.
+    """
+
+    floor_m: float | None = None
+    """Lowest altitude; absent = none."""
+
+    ceiling_m: float | None = None
+    """Highest altitude, above the floor; absent = none."""
+
+
 class LimitsTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits of the states, a table for each kind of body."""
 
     vehicle: VehicleLimits = VehicleLimits()
     """Of vehicles."""
+
+    target: TargetLimits = TargetLimits()
+    """Of targets (also ``consensus_mhe``)."""
 
 
 class LocalWindowTable(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -31,6 +31,7 @@ def shared_settings(config: FleetConfig) -> Agreement:
         "fleet.joint_bodies": str(fleet.joint_bodies),
         "fleet.origin": f"{origin.lat_deg:.9f} {origin.lon_deg:.9f} {origin.alt_m:.3f} {origin.altitude}",
         "fleet.period_s": repr(float(fleet.period_s)),
+        "targets.id": _listed(sorted(f"{target.id} {target.motion}" for target in config.targets)),
     })  # fmt: skip
 
 

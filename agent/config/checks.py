@@ -24,6 +24,7 @@ def faults_between(config: FleetConfig) -> Iterator[Fault]:
     """Everything that does not go together, or is no address, in settings that are right one by one."""
     yield from _estimator(config)
     yield from _agents(config)
+    yield from _targets(config)
     yield from _edges(config)
     yield from _anchors(config)
     yield from _uwb_pairs(config)
@@ -65,6 +66,23 @@ def _limits(settings: EstimatorSettings) -> Iterator[Fault]:
             if sides[0] >= box or sides[1] <= -box:
                 expected = f"a part of +-{box:g}, which estimator.state_box_position_m leaves"
                 yield Fault(f"{key}.{name}", expected, f"{list(sides)}")
+
+
+def _targets(config: FleetConfig) -> Iterator[Fault]:
+    """A target is nobody else, and has room in the joint state."""
+    for index, target in enumerate(config.targets):
+        if target.id in config.bodies[: len(config.ids) + index] or target.id in config.places_m:
+            yield Fault(f"targets[{index}].id", "an id that no other body has", str(target.id))
+    if config.targets and len(config.ids) > config.fleet.joint_bodies:
+        expected = f"none where the agents are more than fleet.joint_bodies = {config.fleet.joint_bodies}"
+        yield Fault("targets", expected, str(len(config.targets)))
+    limits, key = config.estimator.limits.target, "estimator.limits.target"
+    for name in ("floor_m", "ceiling_m"):
+        value = getattr(limits, name)
+        if value is not None and not math.isfinite(value):
+            yield Fault(f"{key}.{name}", "a finite altitude", f"{value:g}")
+    if limits.floor_m is not None and limits.ceiling_m is not None and not limits.floor_m < limits.ceiling_m:
+        yield Fault(f"{key}.ceiling_m", f"above floor_m = {limits.floor_m:g}", f"{limits.ceiling_m:g}")
 
 
 def _agents(config: FleetConfig) -> Iterator[Fault]:

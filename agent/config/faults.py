@@ -11,6 +11,8 @@ from typing import Any
 from agent.config.toml_lines import KeyPath
 
 STEP = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
+BODIES = {"agents": "agent", "anchors": "anchor", "targets": "target"}
+"""Arrays whose tables are bodies, and what one is called."""
 NAMED_BY = ("id", "agent")
 """Keys that tell the tables of an array apart."""
 
@@ -54,10 +56,9 @@ def shown(tables: Any, key: str) -> str:
         if isinstance(step, int):
             text += f", entry {step + 1}"
         elif step.startswith("#"):
-            own = text in ("agents", "anchors")
-            text = f"{text[:-1]} {step[1:]}" if own else f"{text} of agent {step[1:]}"
+            text = f"{BODIES[text]} {step[1:]}" if text in BODIES else f"{text} of agent {step[1:]}"
         else:
-            separator = ", " if re.search(r"(agent|anchor|entry) \d+$", text) else "."
+            separator = ", " if re.search(r"(agent|anchor|target|entry) \d+$", text) else "."
             text += f"{separator}{step}" if text else step
     return text
 

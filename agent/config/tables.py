@@ -16,6 +16,7 @@ from agent.config.other_tables import OtherTables
 from agent.config.security_table import SecurityTable
 from agent.radio.radio_faults import FaultsTable
 from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
+from estimators.model.layout import BodyKind, Kinds, Layout
 from estimators.settings import EstimatorSettings, default_settings
 from transport.messages.uwb_body import MAX_TAGS
 
@@ -126,6 +127,17 @@ class UwbPair(Table, frozen=True):
     """How much too long their ranges are; it is subtracted."""
     sigma_m: Positive | None = None
     """1-sigma of a range between them whose driver gives none; absent = ``uwb_sigma_m``."""
+
+
+class TargetTable(Table, frozen=True):
+    """``[[targets]]``: a body that is no part of the fleet, which its drones range under this id."""
+
+    id: AgentId
+    """Of the target, in packets and files; no drone has it."""
+    name: str = ""
+    """For people only."""
+    motion: Literal["moving", "fixed"] = "moving"
+    """Whether it moves; a fixed one is an anchor whose place the fleet surveys."""
 
 
 class SensorsTable(Table, frozen=True):
@@ -264,6 +276,22 @@ class FleetConfig(Table, frozen=True):
     adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)
     others: OtherTables = msgspec.field(default_factory=OtherTables)
     """Tables that other rooms read; no key of the file has this name."""
+    targets: tuple[TargetTable, ...] = ()
+
+    @property
+    def bodies(self) -> tuple[int, ...]:
+        """Ids of all bodies of the state in the order of its blocks: the drones, then the targets."""
+        return (*self.ids, *(target.id for target in self.targets))
+
+    @property
+    def kinds(self) -> Kinds:
+        """What the bodies are that are no drones."""
+        return {t.id: BodyKind.ANCHOR if t.motion == "fixed" else BodyKind.TARGET for t in self.targets}
+
+    @property
+    def layout(self) -> Layout:
+        """Of the state of all bodies."""
+        return Layout.of(self.bodies, self.kinds)
 
     @property
     def ids(self) -> tuple[int, ...]:

@@ -20,6 +20,7 @@ from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
 from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
+from estimators.model.limits import target_limits
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
 from transport.messages.measurement_body import (
@@ -34,6 +35,11 @@ MAX_RANGES = 48
 MIN_RANGES = 4
 CORRELATED = 4.0
 """On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
+
+TARGET_SIGMA_M = 15.0
+"""A target less well known is not one of the state yet."""
+TARGET_BIAS_M = 0.5
+"""1-sigma of the bias of ranges to it, which all share."""
 
 _Place = tuple[Vector, Matrix]
 """Mean ``(6,)`` and position covariance ``(3, 3)``."""
@@ -50,7 +56,9 @@ class RangeLocator:
         self._motions = motions
         self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
-        self._monitor = RangeLocationMonitor()
+        self._monitor, self._target_monitor = RangeLocationMonitor(), RangeLocationMonitor(TARGET_SIGMA_M)
+        self._targets = frozenset(config.kinds)
+        self._target_limits = target_limits(config.estimator)
         self.findings: dict[int, tuple[Finding, ...]] = {}
         """Why a drone's ranges did not locate it, as of the last attempt."""
 
@@ -77,7 +85,8 @@ class RangeLocator:
         self.findings[agent_id] = ()
         if found is None:
             return None
-        self.findings[agent_id] = self._monitor.observe(RangeLocation(found.fits, len(found.rivals), found.sigma_m))
+        monitor = self._target_monitor if agent_id in self._targets else self._monitor
+        self.findings[agent_id] = monitor.observe(RangeLocation(found.fits, len(found.rivals), found.sigma_m))
         return None if self.findings[agent_id] else (found.mean, CORRELATED * found.covariance)
 
     def _fit(self, agent_id: int, at_tick: int) -> Place | None:
@@ -97,6 +106,8 @@ class RangeLocator:
         for _, other, _ in usable:
             count[other] += 1
         anchors, leads, shifts, values, variances = [], [], [], [], []
+        is_target = agent_id in self._targets
+        biased = TARGET_BIAS_M**2 if is_target else 0.0
         for record, other, (mean, covariance) in usable:
             back = at_tick - record.tick
             shift = self._arms.shift(record) if isinstance(record, RangeMeasurement) else Shift()
@@ -107,9 +118,9 @@ class RangeLocator:
             values.append(record.range_m)
             # an error that all ranges to a drone share does not average out over their number
             shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
-            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[back])
+            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[back] + biased)
         ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
-        return multilaterate(ranges, VELOCITY_SIGMA_MPS)
+        return multilaterate(ranges, VELOCITY_SIGMA_MPS, self._target_limits if is_target else None)
 
     def _place_of(self, record: RangeMeasurement | AnchorRangeMeasurement, other: int | Triple) -> _Place | None:
         """The other end of a range at its tick, if that is known."""

@@ -66,6 +66,8 @@ class Membership:
         self._locator = RangeLocator(config, self._motions)
         self._geometry = GeometryMonitor()
         self._heard: dict[int, int] = {}
+        self._sensed: set[int] = set()
+        """Whose own fixes or ranges came, not only accelerations, which may travel farther."""
         self._ranged: dict[tuple[int, int], int] = {}
         """Tick of the last range, by the ids of its ends."""
         self._anchored: dict[tuple[int, int], int] = {}
@@ -76,6 +78,7 @@ class Membership:
         self._told: dict[int, tuple[int, Prior]] = {}
         self._sigma_m: dict[int, float] = {}
         self._places: dict[int, Vector] = {}
+        self._targets = frozenset(config.kinds)
         self.members: tuple[int, ...] = ()
         self.own_located = False
         self.wanted: frozenset[int] | None = None
@@ -100,13 +103,18 @@ class Membership:
             self._heard[record.observer] = when
         if isinstance(record, AccelerationMeasurement):
             self._motions.note(record)
-        elif isinstance(record, OrientationMeasurement):
+            return
+        if isinstance(record, OrientationMeasurement):
             self._locator.note(record)
-        elif isinstance(record, RangeMeasurement):
+            return
+        self._sensed.add(record.observer)
+        if isinstance(record, RangeMeasurement):
             self._locator.note(record)
             pair = _pair(record.observer, record.other)
             if when > self._ranged.get(pair, -math.inf):
                 self._ranged[pair] = when
+            if record.other in self._targets and when > self._heard.get(record.other, -math.inf):
+                self._heard[record.other] = when
         elif isinstance(record, AnchorRangeMeasurement):
             self._locator.note(record)
             self._note_anchor(record, when)
@@ -143,7 +151,7 @@ class Membership:
 
     def _is_news(self, agent: int) -> bool:
         """Whether what a neighbour says of a drone may locate it."""
-        known = agent in self.located or (agent in self._heard and agent != self._agent_id)
+        known = agent in self.located or (agent in self._sensed and agent != self._agent_id)
         return not known and self.may_be_member(agent)
 
     def note_estimate(self, estimate: Estimate) -> None:
@@ -184,7 +192,7 @@ class Membership:
         """Drones located since, with their priors at ``at_tick``: new ones, and those that had been lost sight of."""
         found: dict[int, Prior] = {}
         usable = self.usable(tick)
-        for agent in self._config.ids:
+        for agent in self._config.bodies:
             if agent not in usable and self.may_be_member(agent):
                 prior = self._place(agent, tick, at_tick)
                 if prior is not None:
@@ -202,7 +210,7 @@ class Membership:
         joined = set(joined)
         self.own_located |= self._agent_id in joined
         wanted = (set(self.members) | joined | {self._agent_id}) - set(left)
-        self.members = tuple(agent for agent in self._config.ids if agent in wanted)
+        self.members = tuple(agent for agent in self._config.bodies if agent in wanted)
         for agent in joined:
             self._joined[agent] = self._held[agent] = tick
 
@@ -229,7 +237,7 @@ class Membership:
 
     def may_be_member(self, agent: int) -> bool:
         """Whether an agent is wanted in the estimate."""
-        return self.wanted is None or agent in self.wanted
+        return self.wanted is None or agent in self.wanted or agent in self._targets
 
     def _place(self, agent: int, tick: int, at_tick: int) -> Prior | None:
         heard = tick - self._heard.get(agent, -math.inf) <= RANGED_TICKS

@@ -6,7 +6,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from estimators.model.measurements import Matrix, Vector
-from estimators.model.unknown_motion import unseen_variance
+from estimators.model.unknown_motion import TARGET_ACCEL_VARIANCE, unseen_variance
 from transport.messages.measurement_body import AccelerationMeasurement, Measurement
 
 MEMORY_TICKS = 60
@@ -18,6 +18,7 @@ class Motions:
     def __init__(self, config: FleetConfig) -> None:
         self._period_s = config.fleet.period_s
         self._unknown_variance = config.estimator.other_accel_variance
+        self._kinds = config.kinds
         self._known: dict[int, dict[int, AccelerationMeasurement]] = {}
 
     def note(self, record: Measurement) -> None:
@@ -44,11 +45,12 @@ class Motions:
             record = known.get(tick - back)
             accel = np.zeros(3) if record is None else np.array(record.accel_mps2)
             unseen = unseen + 1 if record is None else 0
-            variance = (
-                unseen_variance(unseen, self._unknown_variance, period_s)
-                if record is None
-                else max(record.variance_m2ps4)
-            )
+            if record is not None:
+                variance = max(record.variance_m2ps4)
+            elif agent_id in self._kinds:  # it never tells, and moves as it is said to
+                variance = TARGET_ACCEL_VARIANCE
+            else:
+                variance = unseen_variance(unseen, self._unknown_variance, period_s)
             earlier = velocity - accel * period_s
             moved[back] = moved[back - 1] - 0.5 * (velocity + earlier) * period_s
             velocity = earlier

@@ -221,7 +221,7 @@ class FleetTracker:
                 blocks[agent] = mean[block(slot)], covariance[block(slot), block(slot)]
         self.roll.enter(fresh, (), tick)
         blocks |= fresh
-        layout = Layout(self.roll.members)
+        layout = Layout.of(self.roll.members, self._config.kinds)
         mean, covariance = np.zeros(layout.dimension), np.zeros((layout.dimension, layout.dimension))
         for slot, agent in enumerate(layout.agents):
             own = block(slot)
@@ -265,7 +265,7 @@ class FleetTracker:
         self._counters["drones joined"] += len(fresh)
         self._counters["drones gone"] += len(gone)
         self.roll.enter(fresh, gone, tick)
-        self._estimator.change_members(self.roll.members, self._agent_id, fresh)
+        self._estimator.change_members(self.roll.members, self._agent_id, fresh, self._config.kinds)
 
     def _unseen_manoeuvres(self, tick: int) -> InputTable:
         """Accelerations, unknown, of drones silent for so long that none will come any more.
@@ -276,7 +276,7 @@ class FleetTracker:
         settings = self._config.estimator
         for slot, agent in enumerate(self.roll.members if tick % 2 == 0 else ()):
             silent = self.roll.silent_ticks(agent, tick)
-            if silent > settings.window:
+            if silent > settings.window and agent not in self._config.kinds:
                 variance = unseen_variance(silent, settings.other_accel_variance, self._period_s)
                 tables.append(input_rows(tick - 1, slot, np.zeros(3), 2.0 * variance))
         return np.concatenate(tables) if tables else empty_inputs()

@@ -55,7 +55,7 @@ def header_of(config: FleetConfig, agent_id: int) -> EstimateLogHeader:
         format=FORMAT if joint is None else FORMAT_JOINT,
         fleet=config.fleet.name,
         agent=agent_id,
-        agents=config.ids,
+        agents=config.bodies,
         period_s=config.fleet.period_s,
         epoch_unix_s=config.fleet.epoch_unix_s,
         joint=joint,

@@ -168,7 +168,7 @@ class _Files:
         except OSError as error:
             raise LogFileError(f"record {stem}{SUFFIX}: cannot be written: {error.strerror or error}") from error
         fleet = config.fleet
-        self._estimates = EstimateChannels(self._mcap, config.ids, fleet.period_s, fleet.epoch_unix_s)
+        self._estimates = EstimateChannels(self._mcap, config.bodies, fleet.period_s, fleet.epoch_unix_s)
         self._schemas = {kind: input_schema(kind) for kind in NAMES}
         self._sequence = 0
         self._waiting_bytes = 0

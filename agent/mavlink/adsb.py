@@ -1,4 +1,4 @@
-"""The neighbours on a ground station's map: one ADSB_VEHICLE each, once a second.
+"""The neighbours and targets on a ground station's map: one ADSB_VEHICLE each, once a second.
 
 They go to a ground station (or the router before it) on a link of their own, never to an autopilot, which would
 evade its own fleet. The id is made of our own range (0xF00000 and the agent's id), the callsign names it.
@@ -33,9 +33,9 @@ MIN_HEADING_SPEED_MPS = 0.3
 def traffic(
     estimate: Estimate, config: FleetConfig, agent_id: int, frame: FleetFrame, *, since_s: float = 0.0
 ) -> Iterator[Message]:
-    """One message for each neighbour that an estimate, ``since_s`` old, knows well enough."""
+    """One message for each neighbour and target that an estimate, ``since_s`` old, knows well enough."""
     sigma_m = estimate.covariance.diagonal() ** 0.5
-    for slot, other in enumerate(config.ids):
+    for slot, other in enumerate(config.bodies):
         age_s = float(estimate.age_ticks[slot]) * config.fleet.period_s + since_s
         known = max(sigma_m[6 * slot : 6 * slot + 3]) <= MAX_SIGMA_M
         if other == agent_id or not known or age_s > MAX_AGE_S:

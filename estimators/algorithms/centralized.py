@@ -9,7 +9,7 @@ import numpy as np
 from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.observability import row_jacobian
 from estimators.model.gaussian import Prior, symmetrised
-from estimators.model.layout import Layout
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.motion import input_matrix, predict_mean, transition_matrix
 from estimators.settings import EstimatorSettings
@@ -120,6 +120,8 @@ class CentralizedEkf:
             self.window.ages(),
         )
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """A yardstick of fixed fleets."""
         raise RuntimeError("the fleet of a centralised filter is fixed")

@@ -20,7 +20,7 @@ import numpy as np
 from estimators.consensus.information import metropolis_weights
 from estimators.estimator import Estimate, Payload, SolverReport, Status
 from estimators.model.gaussian import Prior, symmetrised
-from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
+from estimators.model.layout import ALL_VEHICLES, STATES_PER_AGENT, Kinds, Layout, block, states_of
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
 from estimators.model.motion import predict_mean
@@ -130,9 +130,11 @@ class ConsensusMovingHorizonEstimator:
             SolverReport(max(self.rounds, 1), local.programs, 0.0, local.active),
         )
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """Let agents join and leave, see `estimators.estimator.Estimator`."""
-        change = MemberChange.between(self.layout, agents, own, fresh)
+        change = MemberChange.between(self.layout, agents, own, fresh, kinds)
         path = np.zeros((len(self._path), change.after.dimension))
         path[:, states_of(list(change.stayed))] = self._path[:, states_of(list(change.stayed.values()))]
         for slot, (mean, _) in change.fresh.items():
@@ -197,4 +199,9 @@ def _model(settings: EstimatorSettings) -> LocalModel:
     """The local problem's weights as the settings have them."""
     table = settings.local_window
     gate_m = np.inf if table.range_gate_m is None else table.range_gate_m
-    return LocalModel(neighbour_sigma_m=table.neighbour_sigma_m, range_gate_m=gate_m)
+    ceiling_m = settings.limits.target.ceiling_m
+    return LocalModel(
+        neighbour_sigma_m=table.neighbour_sigma_m,
+        range_gate_m=gate_m,
+        ceiling_m=np.inf if ceiling_m is None else ceiling_m,
+    )

@@ -18,7 +18,7 @@ from estimators.estimator import Estimate, Payload, Status
 from estimators.integrity.observability import observability_rank
 from estimators.model.corrections import add_corrections
 from estimators.model.gaussian import Prior, symmetrised
-from estimators.model.layout import Layout
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout
 from estimators.model.measurements import ROW, InputTable, Matrix, RowTable, Vector, empty_rows
 from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import predict_information, predict_mean, predict_state
@@ -197,9 +197,11 @@ class DistributedEkf:
             self.window.ages(),
         )
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """Let agents join and leave, see `estimators.estimator.Estimator`."""
-        change = MemberChange.between(self.layout, agents, own, fresh)
+        change = MemberChange.between(self.layout, agents, own, fresh, kinds)
         self.state = self.state.reindexed(change)
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)

@@ -12,7 +12,7 @@ from estimators.consensus.fusion import Fusion
 from estimators.consensus.rank import WindowRank
 from estimators.estimator import Estimate, Payload, Status
 from estimators.model.gaussian import Prior
-from estimators.model.layout import Layout
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.members import InformationState, MemberChange
 from estimators.settings import EstimatorSettings
@@ -97,9 +97,11 @@ class MovingHorizonEstimator:
         mean = solution.path[-1]
         return Estimate(self.window.last, mean, covariance, status, self.window.ages(), solution.report)
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """Let agents join and leave, see `estimators.estimator.Estimator`."""
-        change = MemberChange.between(self.layout, agents, own, fresh)
+        change = MemberChange.between(self.layout, agents, own, fresh, kinds)
         self.arrival = self.arrival.reindexed(change)
         self.layout, self.slot = change.after, change.own
         self.window.change_members(change)

@@ -28,7 +28,7 @@ from estimators.integrity.innovations import InnovationMonitor
 from estimators.integrity.places.ambiguity import Body
 from estimators.integrity.thresholds import DECISIVE_NATS
 from estimators.model.gaussian import Pair, Prior, symmetrised
-from estimators.model.layout import Layout, block
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout, block
 from estimators.model.limits import state_limits
 from estimators.model.measurements import InputTable, Matrix, RowTable, Vector
 from estimators.model.members import InformationState, MemberChange
@@ -76,7 +76,7 @@ class SharedMovingHorizonEstimator:
         self.period_s = period_s
         self.rounds = settings.rounds
         self.window = open_window(settings, layout, period_s)
-        self._sizes = SystematicSizes(layout.size, period_s) if settings.systematic_errors else None
+        self._sizes = SystematicSizes(layout, period_s) if settings.systematic_errors else None
         mean, covariance = np.array(prior_mean, float), symmetrised(np.asarray(prior_covariance, float))
         self.belief = SlowBelief.first(mean, covariance, self._present_sizes())
         """About the window's start, before consensus."""
@@ -90,7 +90,7 @@ class SharedMovingHorizonEstimator:
         self._rival: Rival | None = None
         """The same fleet with a drone at another place, while that is possible."""
         self._passages = Passages(layout.size)
-        self._limits = state_limits(settings, layout.size)
+        self._limits = state_limits(settings, layout)
         self._monitors = SharedMonitors(
             layout, slot, mean, covariance, period_s, settings.norm_smoothing_m, self._limits
         )
@@ -311,9 +311,11 @@ class SharedMovingHorizonEstimator:
             return Status.NOT_CONVERGED
         return Status.OK if has_rows else Status.NO_DATA
 
-    def change_members(self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> None:
+    def change_members(
+        self, agents: Sequence[int], own: int, fresh: Mapping[int, Prior], kinds: Kinds = ALL_VEHICLES
+    ) -> None:
         """Let agents join and leave, see `estimators.estimator.Estimator`."""
-        change = MemberChange.between(self.layout, agents, own, fresh)
+        change = MemberChange.between(self.layout, agents, own, fresh, kinds)
         if self._sizes is not None:
             self._sizes.change_members(change)
         self.belief = self.belief.reindexed(change, self._present_sizes())
@@ -324,7 +326,7 @@ class SharedMovingHorizonEstimator:
         self._consensus.change_members(change)
         self._innovations.change_members(change)
         began = {each: self._at_last_tick(each, prior) for each, prior in change.fresh.items()}
-        self._limits = state_limits(self.settings, self.layout.size)
+        self._limits = state_limits(self.settings, self.layout)
         self._monitors.change_members(change, began, self._limits)
 
     def _keep_doubt(self, change: MemberChange) -> None:

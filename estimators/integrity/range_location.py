@@ -21,7 +21,10 @@ class RangeLocation:
 
 
 class RangeLocationMonitor:
-    """Without memory."""
+    """Without memory; a place has to be known to ``limit_m``."""
+
+    def __init__(self, limit_m: float = HELD_SIGMA_M) -> None:
+        self._limit_m = limit_m
 
     def observe(self, evidence: RangeLocation) -> tuple[Finding, ...]:
         """Nothing if the place can be taken; the rivals of a place that does not fit say nothing."""
@@ -30,6 +33,6 @@ class RangeLocationMonitor:
         found = []
         if evidence.rivals:
             found.append(Finding(What.AMBIGUOUS, Gravity.ALARM, value=evidence.rivals, limit=0))
-        if evidence.sigma_m > HELD_SIGMA_M:
-            found.append(Finding(What.UNCERTAIN, Gravity.NOTED, value=evidence.sigma_m, limit=HELD_SIGMA_M))
+        if evidence.sigma_m > self._limit_m:
+            found.append(Finding(What.UNCERTAIN, Gravity.NOTED, value=evidence.sigma_m, limit=self._limit_m))
         return tuple(found)

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
+from types import MappingProxyType
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,9 +18,16 @@ class BodyKind(IntEnum):
     """What a body of the state is; each has one block, whatever its kind."""
 
     VEHICLE = 0
-    """Flies with an agent of its own, which measures its acceleration."""
+    """Flies with an agent of its own, which tells its acceleration."""
     TARGET = 1
-    """Is no part of the fleet: nothing is told of its motion, and it measures nothing."""
+    """Is no part of the fleet and moves: nothing is told of its motion, and it measures nothing."""
+    ANCHOR = 2
+    """The same, and stands still."""
+
+
+Kinds = Mapping[int, BodyKind]
+"""What bodies are, by id; who is not in it is a vehicle."""
+ALL_VEHICLES: Kinds = MappingProxyType({})
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,20 +39,27 @@ class Layout:
     agents : tuple of int
         Ids (1..999) of the bodies in the order of their blocks. The block of ``agents[s]`` is the *slot* ``s``;
         everything below the estimator interface speaks of slots.
-    targets : frozenset of int
-        Ids of those that are targets; all others are vehicles.
+    kinds : tuple of BodyKind
+        What they are, in the same order; empty: all are vehicles.
     """
 
     agents: tuple[int, ...]
-    targets: frozenset[int] = frozenset()
+    kinds: tuple[BodyKind, ...] = ()
 
     def __post_init__(self) -> None:
-        if not self.targets <= set(self.agents):
-            raise ValueError(f"layout: targets {sorted(self.targets)} are not all among {self.agents}")
+        if not self.kinds:
+            object.__setattr__(self, "kinds", (BodyKind.VEHICLE,) * len(self.agents))
+        if len(self.kinds) != len(self.agents):
+            raise ValueError(f"layout: {len(self.kinds)} kinds for {len(self.agents)} bodies")
         if len(set(self.agents)) != len(self.agents):
             raise ValueError(f"layout: agent ids must be distinct, found {self.agents}")
         if not self.agents:
             raise ValueError("layout: a fleet needs at least one agent")
+
+    @classmethod
+    def of(cls, agents: Sequence[int], kinds: Kinds = ALL_VEHICLES) -> Layout:
+        """That of bodies in an order, of which those in ``kinds`` are no vehicles."""
+        return cls(tuple(agents), tuple(kinds.get(agent, BodyKind.VEHICLE) for agent in agents))
 
     @property
     def size(self) -> int:
@@ -56,14 +71,15 @@ class Layout:
         """Length of the fleet state, 6n."""
         return STATES_PER_AGENT * len(self.agents)
 
-    def kind(self, slot: int) -> BodyKind:
-        """What the body of a slot is."""
-        return BodyKind.TARGET if self.agents[slot] in self.targets else BodyKind.VEHICLE
-
     @property
     def target_slots(self) -> tuple[int, ...]:
-        """Slots of the targets, ascending."""
-        return tuple(slot for slot, agent in enumerate(self.agents) if agent in self.targets)
+        """Slots of the bodies that are no vehicles, ascending."""
+        return tuple(slot for slot, kind in enumerate(self.kinds) if kind is not BodyKind.VEHICLE)
+
+    @property
+    def is_vehicle(self) -> NDArray[np.bool_]:
+        """``(n,)`` which are vehicles."""
+        return np.array([kind is BodyKind.VEHICLE for kind in self.kinds])
 
     def slot(self, agent_id: int) -> int:
         """Slot of an agent id; raises ``KeyError`` naming the id if it is not in the fleet."""

@@ -14,7 +14,7 @@ from typing import Self
 import numpy as np
 
 from estimators.model.gaussian import Pair, Prior, marginal_pair, symmetrised
-from estimators.model.layout import Layout, block, states_of
+from estimators.model.layout import ALL_VEHICLES, Kinds, Layout, block, states_of
 from estimators.model.measurements import Matrix, Vector
 
 
@@ -44,13 +44,20 @@ class MemberChange:
     known: Mapping[int, int]
 
     @classmethod
-    def between(cls, before: Layout, agents: Sequence[int], own: int, fresh: Mapping[int, Prior]) -> Self:
-        """The change to the fleet ``agents`` (ids) with the agent ``own``; ``fresh`` by id.
+    def between(
+        cls,
+        before: Layout,
+        agents: Sequence[int],
+        own: int,
+        fresh: Mapping[int, Prior],
+        kinds: Kinds = ALL_VEHICLES,
+    ) -> Self:
+        """The change to the fleet ``agents`` (ids) with the agent ``own``; ``fresh`` by id, ``kinds`` of all.
 
         Raises ``KeyError`` for an agent that is neither in the old fleet nor fresh, and for a fresh or own one that
         is not in the new fleet.
         """
-        after = Layout(tuple(agents))
+        after = Layout.of(agents, kinds)
         stayed = {slot: before.slot(agent) for slot, agent in enumerate(after.agents) if agent not in fresh}
         replaced = {after.slot(agent): before.slot(agent) for agent in fresh if agent in before.agents}
         priors = {after.slot(agent): prior for agent, prior in fresh.items()}

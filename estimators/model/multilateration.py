@@ -68,8 +68,12 @@ class Place:
         return self.cost <= MAX_COST_RATIO * max(self.surplus, 3)
 
 
-def multilaterate(ranges: RangeSet, speed_sigma_mps: float) -> Place | None:
+def multilaterate(
+    ranges: RangeSet, speed_sigma_mps: float, limits: tuple[Vector, Vector] | None = None
+) -> Place | None:
     """The place of least cost with all others that cost nearly as little; ``None`` without ranges.
+
+    ``limits``: lowest and highest state ``(6,)``; places beyond count for nothing, ``None`` where all are.
 
     ``speed_sigma_mps`` is the 1-sigma per axis of the velocity about zero. An unobservable place comes with the
     covariance that says so.
@@ -80,6 +84,11 @@ def multilaterate(ranges: RangeSet, speed_sigma_mps: float) -> Place | None:
     mirrored = _mirrored(states, ranges.anchor_m)
     more, more_costs = _descend(mirrored, ranges, speed_sigma_mps)
     states, costs = np.concatenate((states, more)), np.concatenate((costs, more_costs))
+    if limits is not None:
+        within = ((states[:, :3] >= limits[0][:3]) & (states[:, :3] <= limits[1][:3])).all(axis=1)
+        if not within.any():
+            return None
+        states, costs = states[within], costs[within]
     best = int(np.argmin(costs))
     information = _information(states[best], ranges, speed_sigma_mps)
     covariance = np.linalg.inv(information)

@@ -8,6 +8,8 @@ from estimators.model.measurements import Vector
 
 MANOEUVRE_S = 3.0
 """How long an acceleration that is not known lasts."""
+TARGET_ACCEL_VARIANCE = 0.02**2
+"""Of the acceleration of a target, (m/s2)2 per axis, drawn anew each tick: what walks or drives on the ground."""
 TILTED_MPS2 = 0.35
 """1-sigma per horizontal axis of an acceleration whose attitude is that of an autopilot without positions: 2 degrees
 of tilt. On PX4 1.9 to 2.6 degrees were measured, 0.33 to 0.45 m/s2, in one direction for 20 s."""

@@ -9,8 +9,10 @@ every receiver by `estimators.systematic.receiver_wander`, the others by the sec
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
+from estimators.model.layout import Layout
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
 from estimators.model.row_kernels import POSITION
@@ -31,6 +33,8 @@ ACCEL_MPS2 = 0.15, 0.02, 1.0
 """The same of the error of an acceleration."""
 LOST_S = 1.0
 """Without fixes for longer, an autopilot's attitude is taken for that of an estimator without aiding."""
+TARGET_PAIR_M = 0.5
+"""Of the bias of ranges to a body that is no vehicle: of another sensor, of which the fleet's tell nothing."""
 MEMORY_S = 3.0
 """Of the second moments."""
 
@@ -38,10 +42,12 @@ MEMORY_S = 3.0
 class SystematicSizes:
     """The sizes of one fleet's slow errors, as one agent learns them."""
 
-    def __init__(self, agents: int, period_s: float) -> None:
+    def __init__(self, layout: Layout, period_s: float) -> None:
+        agents = layout.size
         self._share = period_s / MEMORY_S
         self._wanders = ReceiverWanders(agents, period_s)
         self._pair_m = PAIR_M[0]
+        self._of_target = _pairs_with_others(layout)
         self._accel_mps2: Vector = np.full(agents, ACCEL_MPS2[0])
         self._lost_ticks = np.zeros(agents, np.int64)
         """Since the last fix that left the window."""
@@ -58,7 +64,12 @@ class SystematicSizes:
         self._wanders.weigh(rows, accel, accel_variance)
         self._lost_ticks += 1
         self._lost_ticks[rows["agent"][rows["kind"] == POSITION]] = 0
-        moments = errors**2 + variance
+        moments, agents = errors**2 + variance, len(self._accel_mps2)
+        if self._of_target.all():
+            agents_pairs = np.array([self._pair_m**2])
+        else:
+            agents_pairs = moments[slow_errors.pairs(agents)][~self._of_target]
+        moments = np.concatenate((moments[: slow_errors.pairs(agents).start], agents_pairs))
         self._pair_m = _follow(moments, self._share, self._wanders.sizes_m(), self._pair_m, self._accel_mps2)
 
     def sizes(self) -> Vector:
@@ -72,6 +83,7 @@ class SystematicSizes:
         out = np.empty(slow_errors.count(agents))
         tilted = np.where(self._lost_ticks > self._most_ticks, TILTED_MPS2, 0.0)
         _fill(self._wanders.sizes_m(), self._accel_mps2, tilted, self._pair_m, out)
+        out[slow_errors.pairs(agents)][self._of_target] = TARGET_PAIR_M
         return out
 
     def white_factors(self) -> Matrix:
@@ -81,12 +93,19 @@ class SystematicSizes:
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet."""
         self._made, known = None, change.stayed
+        self._of_target = _pairs_with_others(change.after)
         self._wanders.change_members(known, change.after.size)
         self._accel_mps2 = np.array(
             [self._accel_mps2[known[slot]] if slot in known else ACCEL_MPS2[0] for slot in range(change.after.size)]
         )
         lost = self._lost_ticks
         self._lost_ticks = np.array([lost[known[s]] if s in known else 0 for s in range(change.after.size)])
+
+
+def _pairs_with_others(layout: Layout) -> NDArray[np.bool_]:
+    """Which pairs of bodies have one that is no vehicle."""
+    one, other = np.triu_indices(layout.size, 1)
+    return np.asarray(~(layout.is_vehicle[one] & layout.is_vehicle[other]))
 
 
 @entry("float64(float64[::1], float64, float64[:, ::1], float64, float64[::1])")

@@ -8,21 +8,25 @@ from typing import Literal
 import numpy as np
 
 from estimators.compiled.entries import entry, kernel
-from estimators.model.layout import Layout
+from estimators.model.layout import BodyKind, Layout
 from estimators.model.measurements import (
     ROW,
     InputTable,
     Kind,
     Matrix,
     RowTable,
+    Vector,
     empty_rows,
 )
 from estimators.model.members import MemberChange
 from estimators.model.row_kernels import IntArray, mark_usable
+from estimators.model.unknown_motion import TARGET_ACCEL_VARIANCE
 from estimators.window.inputs import InputHistory
 
 SAME_ANTENNAS_M = 0.05
 """Antennas of one drone are further apart; an arm turns by less between the times that both ends give a range."""
+ANCHOR_ACCEL_VARIANCE = 1e-8
+"""Of a body that stands still: what keeps its block from becoming certain."""
 _NEVER = np.iinfo(np.int64).min
 """Of an agent of which nothing was heard."""
 
@@ -41,6 +45,7 @@ class MeasurementWindow:
         ticks: int,
         *,
         other_accel_variance: float,
+        target_accel_variance: float = TARGET_ACCEL_VARIANCE,
         reciprocal_ranges: Literal["independent", "shared"] = "independent",
         unknown_inputs: Literal["zero", "hold"] = "zero",
         held_accel_fade: float = 1.0,
@@ -56,7 +61,12 @@ class MeasurementWindow:
         self._shared = reciprocal_ranges == "shared"
         self._rows = empty_rows()
         hold = unknown_inputs == "hold"
-        self._inputs = InputHistory(layout.size, other_accel_variance, hold=hold, fade=held_accel_fade)
+        self._unknown = {
+            BodyKind.VEHICLE: other_accel_variance,
+            BodyKind.TARGET: target_accel_variance,
+            BodyKind.ANCHOR: ANCHOR_ACCEL_VARIANCE,
+        }
+        self._inputs = InputHistory(self._unknown_variance(), hold=hold, fade=held_accel_fade)
         self._origin: int | None = None
         self._last_heard = np.full(layout.size, _NEVER, np.int64)
 
@@ -107,6 +117,10 @@ class MeasurementWindow:
         agents = len(self._last_heard)
         count, refused, dropped = _take_in(table, self._rows, new, agents, self.first, self._last_heard)
         self._rows = table[:count]
+        for slot in self.layout.target_slots:  # nothing is told by it, only of it
+            ranged = new["tick"][(new["kind"] == Kind.RANGE) & (new["other"] == slot)]
+            if len(ranged):
+                self.hear(slot, int(ranged.max()))
         self.refused += refused
         self.dropped += dropped
 
@@ -137,14 +151,21 @@ class MeasurementWindow:
         for slot, before in change.known.items():
             heard[slot] = self._last_heard[before]
         self._last_heard = heard
-        self._inputs.change_members(change)
+        self._inputs.change_members(change, self._unknown_variance())
+
+    def _unknown_variance(self) -> Vector:
+        """Of the acceleration of each body where it is not known, (m/s2)2 per axis."""
+        return np.array([self._unknown[kind] for kind in self.layout.kinds])
 
     def hear(self, slot: int, tick: int) -> None:
         """Note that information of an agent reached this one by another way than rows."""
         self._last_heard[slot] = max(int(self._last_heard[slot]), tick)
 
     def ages(self) -> IntArray:
-        """Ticks ``(n,)`` since anything that an agent observed entered; where nothing did, since before the start."""
+        """Ticks ``(n,)`` since anything that an agent observed, or that was observed of a target, entered.
+
+        Where nothing did, since before the start.
+        """
         before = -1 if self._origin is None else self._origin - 1
         return np.asarray(self.last - np.maximum(self._last_heard, before))
 

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
-from estimators.model.measurements import INPUT, InputTable, Matrix, empty_inputs
+from estimators.model.measurements import INPUT, InputTable, Matrix, Vector, empty_inputs
 from estimators.model.members import MemberChange
 from estimators.model.row_kernels import IntArray
 
@@ -20,17 +20,18 @@ CHANGES_NEEDED = 3
 class InputHistory:
     """Known accelerations per tick and agent; what arrives first counts.
 
-    An unknown one is zero with ``other_variance`` per axis, or, with ``hold``, the agent's last known one times
-    ``fade`` for every tick since (1: as it was; less: exponentially correlated acceleration, Singer 1970). Its
+    An unknown one is zero with its body's ``other_variance`` ``(n,)`` per axis, or, with ``hold``, the agent's last
+    known one times ``fade`` for every tick since (1: as it was; less: exponentially correlated acceleration, Singer
+    1970). Its
     variance then grows with the square of the ticks it is held: by the mean square error of that prediction over
     one tick that the agent's known accelerations show, and never beyond ``other_variance``. Everything follows
     from what is stored, so that the order of arrival does not matter.
     """
 
-    def __init__(self, agents: int, other_variance: float, *, hold: bool, fade: float = 1.0) -> None:
+    def __init__(self, other_variance: Vector, *, hold: bool, fade: float = 1.0) -> None:
         self._known: InputTable = empty_inputs()
         """By tick, then agent."""
-        self._agents = agents
+        self._agents = len(other_variance)
         self._other_variance = other_variance
         self._hold = hold
         self._fade = fade
@@ -51,14 +52,17 @@ class InputHistory:
         if len(self._known) and self._known["tick"][0] < limit:
             self._known = self._known[np.searchsorted(self._known["tick"], limit) :]
 
-    def change_members(self, change: MemberChange) -> None:
-        """Go on with another fleet: what is known of an agent's motion goes to its new slot."""
+    def change_members(self, change: MemberChange, other_variance: Vector) -> None:
+        """Go on with another fleet: what is known of an agent's motion goes to its new slot.
+
+        ``other_variance`` is that of the new fleet.
+        """
         parts = [self._known[self._known["agent"] == before] for before in change.known.values()]
         for slot, part in zip(change.known, parts, strict=True):
             part["agent"] = slot
         table = np.concatenate([empty_inputs(), *parts])
         self._known = np.ascontiguousarray(table[np.lexsort((table["agent"], table["tick"]))], INPUT)
-        self._agents = change.after.size
+        self._agents, self._other_variance = change.after.size, other_variance
 
     def table(self, first: int, last: int) -> tuple[Matrix, Matrix]:
         """Accelerations ``(last - first, 3n)`` over the ticks from ``first`` on, and their variances."""
@@ -104,17 +108,18 @@ def _take_in(
 
 
 @entry(
-    "void(INPUT[::1], int64, float64, boolean, float64, float64[:, ::1], float64[:, ::1])",
+    "void(INPUT[::1], int64, float64[::1], boolean, float64, float64[:, ::1], float64[:, ::1])",
     INPUT=INPUT,
 )
 def _fill(
-    known: InputTable, first: int, other_variance: float, hold: bool, fade: float, accel: Matrix, variance: Matrix
+    known: InputTable, first: int, other_variance: Vector, hold: bool, fade: float, accel: Matrix, variance: Matrix
 ) -> None:
     """`InputHistory.table`, both ``(ticks, 3n)``, from what is ``known``, sorted by tick."""
     ticks, agents = accel.shape[0], accel.shape[1] // 3
     missing = np.ones((agents, ticks), np.bool_)
     accel[:, :] = 0.0
-    variance[:, :] = other_variance
+    for agent in range(agents):
+        variance[:, 3 * agent : 3 * agent + 3] = other_variance[agent]
     for r in range(known.shape[0]):
         k, agent = known[r]["tick"] - first, known[r]["agent"]
         if 0 <= k < ticks:
@@ -125,7 +130,7 @@ def _fill(
     if hold:
         for agent in range(agents):
             if missing[agent].any():
-                _hold_last(known, agent, missing[agent], first, other_variance, fade, accel, variance)
+                _hold_last(known, agent, missing[agent], first, other_variance[agent], fade, accel, variance)
 
 
 @kernel

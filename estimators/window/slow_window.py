@@ -101,7 +101,9 @@ def slow_problem(
         data[ignored.rows(rows), PRECISION] *= IGNORED_FACTOR
     if len(belief.sizes):
         at, by = slow_errors.couplings(rows, agents)
-        push_at, push_by = np.arange(3 * agents, 6 * agents), np.ones(3 * agents)
+        measured = np.repeat(window.layout.is_vehicle, 3)  # a body that tells no acceleration has no error of it
+        push_at = np.where(measured, np.arange(3 * agents, 6 * agents), -1)
+        push_by = measured.astype(float)
     else:
         at, by = np.full((len(rows), 1), -1, np.int64), np.zeros((len(rows), 1))
         push_at, push_by = np.full(3 * agents, -1, np.int64), np.zeros(3 * agents)

@@ -43,6 +43,7 @@ def register(app: typer.Typer) -> None:
     bench.command("speed")(speed)
     bench.command("fusion")(fusion)
     bench.command("faults")(faults)
+    bench.command("awareness")(awareness)
     bench.command("scale")(scale)
     bench.command("setmembership")(setmembership)
     bench.command("real")(real)
@@ -227,6 +228,41 @@ def partition(
     _write(study(plan, runs=runs, jobs=_jobs(jobs), out=folder), folder, json_file)
 
 
+def awareness(
+    test: Annotated[str, typer.Option(help="1, 2, 3-under, 3-ahead, 4-under, 4-ahead; separated by commas.")] = "1",
+    graph: Annotated[Literal["cycle", "ladder", "chain"], typer.Option(help="Who hears whom.")] = "cycle",
+    kinds: Annotated[str, typer.Option(help="Of estimators, separated by commas.")] = "consensus_mhe,dmhe_shared",
+    rounds: Annotated[str, typer.Option(help="Consensus rounds of a tick, separated by commas.")] = "2,6,10",
+    window: Annotated[int | None, typer.Option(min=1, max=64, help="Ticks; absent: the kind's own.")] = None,
+    loss: Annotated[float, typer.Option(min=0.0, max=0.99, help="Of all packets.")] = 0.0,
+    runs: Runs = 5,
+    seed: Seed = 0,
+    jobs: Jobs = 0,
+    out: OutFolder = None,
+    json_file: JsonFile = None,
+) -> None:
+    """Nine drones on a sparse graph: who knows where the others are, and a target?
+
+    1: drone 1 hovers, the others fly. 2: two links fail for 30 s. 3 and 4: a fixed and a moving target.
+    """
+    from typing import get_args
+
+    from estimators.settings import Kind
+    from fleetloc.bench.awareness import SCENARIOS, AwarenessPlan
+    from fleetloc.bench.awareness import awareness as study
+
+    counts = _whole_numbers("--rounds", rounds, 0, 16)
+    tests, chosen = _names("--test", test, tuple(SCENARIOS)), _names("--kinds", kinds, get_args(Kind))
+    plans = [
+        AwarenessPlan(each, graph, kind, count, window, loss, seed)
+        for each in tests
+        for kind in chosen
+        for count in counts
+    ]
+    folder = _prepare(out)
+    _write(study(plans, runs=runs, jobs=_jobs(jobs)), folder, json_file)
+
+
 def faults(
     config: Annotated[Path, typer.Argument(help="Configuration (TOML) with its [sim].")],
     rows: Annotated[str, typer.Option(help="Names, separated by commas; empty: all.")] = "",
@@ -344,6 +380,16 @@ def _numbers(option: str, text: str, low: float, high: float) -> list[float]:
     if not all(low <= value <= high for value in values):
         raise InputError(option, "", expected, text)
     return values
+
+
+def _names(option: str, text: str, known: tuple[str, ...]) -> list[str]:
+    """A comma-separated list of known names; raises `InputError`."""
+    from fleetloc.errors import InputError
+
+    names = [part.strip() for part in text.split(",") if part.strip()]
+    if not names or not set(names) <= set(known):
+        raise InputError(option, "", f"of {', '.join(known)}, separated by commas", text)
+    return names
 
 
 def _whole_numbers(option: str, text: str, low: int, high: int) -> list[int]:

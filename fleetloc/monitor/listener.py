@@ -51,7 +51,9 @@ class FleetListener:
         if endpoints:
             self._settings = msgspec.structs.replace(self._settings, connect=tuple(endpoints))
         freshness_s = config.security.freshness_s if is_field(config) else None
-        self._opener = Opener(config.fleet.name, config.ids, trust, freshness_s=freshness_s)
+        self._opener = Opener(
+            config.fleet.name, config.ids, trust, freshness_s=freshness_s, bodies=config.bodies
+        )
         self._envelope_refusals: Counter[str] = Counter()
         self._session: Session | None = None
 

@@ -103,17 +103,17 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     start_s, end_s = (float(truth.time_unix_s[i]) - epoch_s for i in (0, -1))
     paths = run_files.records(directory, agent_id)
     parts = [read_entries(path)[1] for path in paths]
-    entries = np.concatenate(parts) if parts else np.empty(0, entry_dtype(len(config.ids)))
+    entries = np.concatenate(parts) if parts else np.empty(0, entry_dtype(len(config.bodies)))
     # the ticks that began and ended while the world moved
     inside = (entries["t_s"] >= start_s - ROUNDING_S) & (entries["t_s"] + period_s <= end_s + ROUNDING_S)
     entries = entries[inside]
     own = position(Layout(config.ids).slot(agent_id))
     when = np.clip(epoch_s + entries["t_s"], truth.time_unix_s[0], truth.time_unix_s[-1])
-    error = entries["mean"] - truth.at(when).reshape(len(entries), STATES_PER_AGENT * len(config.ids))
-    absent = np.repeat(is_absent(entries["age_ticks"]), STATES_PER_AGENT, axis=1)
+    error = _error(entries, truth, when)
+    absent = np.repeat(is_absent(entries["age_ticks"][:, : len(config.ids)]), STATES_PER_AGENT, axis=1)
     error[absent] = 0.0  # nothing is said of them
     known = np.asarray(entries["status"] != Status.NO_DATA)
-    covariance_diagonal = variances_of(entries, len(config.ids))[:, own]
+    covariance_diagonal = variances_of(entries, len(config.bodies))[:, own]
     latency_s = entries["published_s"] - entries["t_s"] - period_s
     on_time = np.asarray(latency_s <= period_s + ROUNDING_S)
     first_tick = int(np.ceil((start_s - ROUNDING_S) / period_s))
@@ -148,15 +148,24 @@ def _served(
     begun = newest >= 0
     newest, of_tick = newest[begun], ticks[begun]
     when = np.clip(config.fleet.epoch_unix_s + of_tick * period_s, truth.time_unix_s[0], truth.time_unix_s[-1])
-    error = estimates["mean"][newest] - truth.at(when).reshape(len(newest), STATES_PER_AGENT * len(config.ids))
-    error[np.repeat(is_absent(estimates["age_ticks"][newest]), STATES_PER_AGENT, axis=1)] = 0.0
+    error = _error(estimates[newest], truth, when)
+    absent = is_absent(estimates["age_ticks"][newest][:, : len(config.ids)])
+    error[np.repeat(absent, STATES_PER_AGENT, axis=1)] = 0.0
     return ServedTicks(time_s, time_s[begun], error[:, own], error, own_ticks[newest] == of_tick)
 
 
+def _error(entries: NDArray[np.void], truth: Truth, when: Floats) -> Floats:
+    """Of the drones' states ``(T, 6n)``; targets stand behind them, and the truth does not know them."""
+    known = truth.at(when).reshape(len(entries), -1)
+    return np.asarray(entries["mean"][:, : known.shape[1]] - known, np.float64)
+
+
 def _nees(entry: np.void, error: Floats) -> float:
-    """Of those who are part of the estimate, over the dimension of their states."""
-    present = np.repeat(~is_absent(entry["age_ticks"]), STATES_PER_AGENT)
-    covariance = covariance_of(entry, len(error) // STATES_PER_AGENT)[np.ix_(present, present)]
+    """Of the drones that are part of the estimate, over the dimension of their states."""
+    drones = len(error) // STATES_PER_AGENT
+    present = np.repeat(~is_absent(entry["age_ticks"][:drones]), STATES_PER_AGENT)
+    whole = covariance_of(entry, len(entry["age_ticks"]))[: len(error), : len(error)]
+    covariance = whole[np.ix_(present, present)]
     try:
         return nees(error[present], covariance) / max(int(present.sum()), 1)
     except np.linalg.LinAlgError:

@@ -44,7 +44,7 @@ class RunObserver:
         self._config = config
         trust, self._envelopes = observer_credentials(config, base, unix_s=time.time())
         self._settings = observer_session(config, base)
-        self._opener = Opener(config.fleet.name, config.ids, trust)
+        self._opener = Opener(config.fleet.name, config.ids, trust, bodies=config.bodies)
         self._told = on_presence
         self._session: Session | None = None
         self.agents = {agent_id: Observed() for agent_id in config.ids}

@@ -194,7 +194,7 @@ class _Pairing:
     def _give_out_pair(self, made: ReplayedTick, recorded: EstimateMessage) -> None:
         assert made.ready is not None
         result, config = self._result, self._result.config
-        again = estimate_message(made.ready, made.published_s, config.ids, config.fleet.period_s)
+        again = estimate_message(made.ready, made.published_s, config.bodies, config.fleet.period_s)
         result.compared += 1
         if tuple(again.agents) == tuple(recorded.agents):
             (mean, sigma), (was_mean, was_sigma) = again.arrays(), recorded.arrays()

@@ -58,9 +58,11 @@ class Opener:
     ----------
     fleet : str
     roster : iterable of int
-        Ids of the whole fleet: who may send, and whom bodies may speak of.
+        Ids of the whole fleet: who may send, and whom messages may speak of.
     trust
         Public keys of everyone in the roster, or `transport.security.auth.UNSIGNED`.
+    bodies : iterable of int, optional
+        Ids that messages may speak of besides those of the roster.
     own_id : int, optional
         Packets that claim to be ours are refused.
     freshness_s : float, optional
@@ -84,6 +86,7 @@ class Opener:
         trust: Trust,
         *,
         own_id: int | None = None,
+        bodies: Iterable[int] = (),
         freshness_s: float | None = None,
         agreement: int | None = None,
         recorded: bool = False,
@@ -93,6 +96,7 @@ class Opener:
         self._fleet_name = check_fleet_name(fleet)
         self._fleet = fleet_hash(fleet)
         self._roster = frozenset(check_agent_id(agent_id) for agent_id in roster)
+        self._bodies = self._roster | frozenset(check_agent_id(body) for body in bodies)
         self._trust = trust
         self._own_id = own_id
         self._freshness_ns = None if freshness_s is None else round(freshness_s * 1e9)
@@ -102,7 +106,7 @@ class Opener:
         self._on_rejected = on_rejected
         self._repeats = RepeatGuard()
         self.peers = PeerTable(self._roster - {own_id})
-        self._reassembler = Reassembler(self._roster, self._count_expired)
+        self._reassembler = Reassembler(self._bodies, self._count_expired)
         if not isinstance(trust, Unsigned):
             missing = sorted(self._roster - {own_id} - trust.keys())
             if missing:
@@ -168,16 +172,16 @@ class Opener:
             case PacketKind.MEAS:
                 proven = h.version > 1 and not isinstance(self._trust, Unsigned)
                 message = decode_measurements(
-                    body, tick=h.tick, count=h.n, roster=self._roster, exchange=h.round, proven=proven
+                    body, tick=h.tick, count=h.n, roster=self._bodies, exchange=h.round, proven=proven
                 )
                 return self._with_genuine_proofs(message, h) if proven else message
             case PacketKind.INFO:
-                part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._roster))
+                part = decode_part(body, tick=h.tick, agents=h.n, double=double, fleet_size=len(self._bodies))
                 return self._reassembler.add(h.sender, h.tick, h.round, part, now)
             case PacketKind.WINDOW:
-                return decode_window(body, tick=h.tick, round_=h.round, agents=h.n, roster=self._roster)
+                return decode_window(body, tick=h.tick, round_=h.round, agents=h.n, roster=self._bodies)
             case PacketKind.EST:
-                return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._roster)
+                return decode_estimate(body, tick=h.tick, agents=h.n, double=double, roster=self._bodies)
             case PacketKind.FAR:
                 return decode_far_reports(body, tick=h.tick, count=h.n, roster=self._roster)
             case PacketKind.CLOCK:

@@ -9,6 +9,7 @@ import pytest
 
 from agent.config.reading import config_from, dump, load_config, load_estimator_settings
 from agent.errors import ConfigError
+from estimators.model.layout import BodyKind
 from estimators.settings import EstimatorSettings
 
 CONFIGS = sorted((Path(__file__).parents[3] / "configs").glob("*.toml"))
@@ -103,6 +104,10 @@ def test_overrides_beat_the_file_and_speak_toml() -> None:
         ("metrics.host=0.0.0", "metrics.host", "an address to listen on", "0.0.0"),
         ("adsb.address=foo", "adsb.address", "udpout:HOST:PORT", "names no transport"),
         ("estimator.kind=centralized_ekf", "estimator.kind", "a kind for agents", "centralized_ekf"),
+        ("estimator.limits.target.ceiling_m=nan", "estimator.limits.target.ceiling_m", "a finite", "nan"),
+        ("targets=[{id=1}]", "target 1, id", "an id that no other body has", "1"),
+        ("targets=[{id=9},{id=9}]", "targets, entry 2, id", "an id that no other body has", "9"),
+        ("targets=[{id=9,motion='jumping'}]", "target 9, motion", "one of", "jumping"),
         ("estimator.limits.vehicle.floor=1", "estimator.limits.vehicle.floor", "one of floor_m", "an unknown key"),
         ("estimator.limits.vehicle.floor_m=inf", "estimator.limits.vehicle.floor_m", "a finite number", "inf"),
         ("estimator.limits.vehicle.east_m=[4,4]", "estimator.limits.vehicle.east_m", "[lowest, highest]", "[4"),
@@ -211,3 +216,18 @@ def test_drones_with_addresses_on_the_radio_may_have_the_same_device() -> None:
     for agent in document["agents"]:
         agent["radio"] = f"192.168.7.{agent['id']}"
     assert config_from(document, "here").agent(3).mavlink == "serial:/dev/ttyAMA0:921600"
+
+
+def test_targets_stand_behind_the_drones_and_say_whether_they_move():
+    config = load_config(LINE3, ["targets=[{id=9},{id=8,motion='fixed'}]", "estimator.limits.target.ceiling_m=5"])
+    assert config.bodies == (*config.ids, 9, 8)
+    assert config.layout.kinds[len(config.ids) :] == (BodyKind.TARGET, BodyKind.ANCHOR)
+    with pytest.raises(ConfigError) as caught:
+        load_config(LINE3, ["estimator.limits.target.ceiling_m=5", "estimator.limits.target.floor_m=6"])
+    assert caught.value.key == "estimator.limits.target.ceiling_m"
+
+
+def test_a_fleet_beyond_its_joint_state_has_no_targets():
+    with pytest.raises(ConfigError) as caught:
+        load_config(LINE3, ["targets=[{id=9}]", "fleet.joint_bodies=2"])
+    assert caught.value.key == "targets"

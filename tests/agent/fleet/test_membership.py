@@ -190,6 +190,13 @@ def test_a_pair_tells_of_drones_out_of_reach_if_it_knows_them_well(make_config: 
     assert sorted(roll.newcomers(7, 7)) == [2]
 
 
+def test_a_drone_whose_accelerations_alone_come_this_far_is_told_of_by_pairs(make_config: MakeConfig) -> None:
+    roll = Membership(make_config(3), 1)
+    roll.note(still(3, 6), 6)
+    roll.note_pair(pair((2, 3), 0.5))
+    assert sorted(roll.newcomers(7, 7)) == [2, 3]
+
+
 def test_who_is_known_from_pairs_alone_goes_when_they_keep_it_no_surer_than_silence(make_config: MakeConfig) -> None:
     roll = Membership(make_config(3), 1)
     roll.enter((1, 3), (), 0)

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from estimators.algorithms.consensus_mhe import ConsensusMovingHorizonEstimator
 from estimators.consensus.information import metropolis_weights
 from estimators.estimator import Payload, Status
-from estimators.model.layout import Layout, block
+from estimators.model.layout import BodyKind, Layout, block
 from estimators.model.measurements import (
     RowTable,
     empty_rows,
@@ -139,7 +139,8 @@ def fleet(case: Case, bodies: int) -> list[ConsensusMovingHorizonEstimator]:
         norm_smoothing_m=SHARP,
         local_window=LocalWindowTable(reinject_own=p["reinject"]),
     )
-    layout = Layout(tuple(range(1, bodies + 1)), frozenset(range(count + 1, bodies + 1)))
+    kinds = (BodyKind.VEHICLE,) * count + (BodyKind.TARGET,) * (bodies - count)
+    layout = Layout(tuple(range(1, bodies + 1)), kinds)
     return [
         ConsensusMovingHorizonEstimator(
             settings, layout, slot, case["X0"][slot].ravel(), np.eye(6 * bodies), p["Ts"], case.model()

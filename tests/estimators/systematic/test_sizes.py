@@ -19,7 +19,7 @@ DT = 0.1
 
 def taught(agents: int, errors: Array, ticks: int = 300) -> SystematicSizes:
     """Without any row, by estimates of the errors that are sure."""
-    sizes = SystematicSizes(agents, DT)
+    sizes = SystematicSizes(Layout(tuple(range(1, agents + 1))), DT)
     for _ in range(ticks):
         nothing = np.zeros(3 * agents)
         sizes.learn(empty_rows(), nothing, nothing + 0.1, errors, np.full(len(errors), 1e-12))
@@ -28,7 +28,7 @@ def taught(agents: int, errors: Array, ticks: int = 300) -> SystematicSizes:
 
 @pytest.mark.parametrize("agents", [1, 2, 5])
 def test_the_first_sizes_are_positive_and_equal_for_all(agents: int) -> None:
-    sizes = SystematicSizes(agents, DT).sizes()
+    sizes = SystematicSizes(Layout(tuple(range(1, agents + 1))), DT).sizes()
     assert sizes.shape == (slow_errors.count(agents),)
     assert (sizes > 0.0).all()
     assert np.ptp(sizes[slow_errors.pairs(agents)] if agents > 1 else [0.0]) == 0.0
@@ -39,7 +39,7 @@ def test_the_first_sizes_are_positive_and_equal_for_all(agents: int) -> None:
 
 @pytest.mark.parametrize("agents", [1, 3])
 def test_own_and_common_wander_together_are_the_receivers(agents: int) -> None:
-    made = SystematicSizes(agents, DT)
+    made = SystematicSizes(Layout(tuple(range(1, agents + 1))), DT)
     sizes = made.sizes()
     whole = sizes[slow_errors.wander_of(0)] ** 2 + sizes[slow_errors.common(agents)] ** 2
     assert whole == pytest.approx(made._wanders.sizes_m()[0] ** 2, rel=1e-5)

@@ -10,6 +10,7 @@ import pytest
 from numpy.typing import NDArray
 
 from estimators.compiled.entries import plain
+from estimators.model.layout import Layout
 from estimators.model.limits import StateLimits, state_limits
 from estimators.model.row_kernels import HALF_WIDTH, PRECISION
 from estimators.settings import EstimatorSettings, LimitsTable, VehicleLimits
@@ -225,7 +226,7 @@ def test_a_prior_far_beyond_a_limit_comes_back_to_it() -> None:
     belief.mean[3 : belief.states : 6] = 40.0
     agents = belief.states // 6
     settings = EstimatorSettings(limits=LimitsTable(vehicle=VehicleLimits(floor_m=0.0, speed_mps=4.0)))
-    limits = state_limits(settings, agents)
+    limits = state_limits(settings, Layout(tuple(range(1, agents + 1))))
     case.problem = slow_problem(case.drawn.window, belief, case.drawn.white, DT, EPS, robust=True)
     # THEN the states keep the limits all the same
     found = limited(case, limits)
@@ -243,11 +244,11 @@ def test_limits_are_turned_into_the_states_own_terms() -> None:
         "state_box_speed_mps": 20.0,
         "noise_bounds": "soft",
     }
-    limits = state_limits(msgspec.convert(table, EstimatorSettings), 2)
+    limits = state_limits(msgspec.convert(table, EstimatorSettings), Layout((1, 2)))
     # THEN they are north, east, down, m and m/s, the narrower where two are given
     assert limits is not None
     assert limits.low.tolist() == 2 * [-50.0, -100.0, -100.0, -20.0, -20.0, -20.0]
     assert limits.high.tolist() == 2 * [80.0, 100.0, 1.0, 20.0, 20.0, 20.0]
     assert limits.speed_mps == 12.0
     assert limits.noise_price == EstimatorSettings().noise_bounds_penalty
-    assert state_limits(EstimatorSettings(), 2) is None
+    assert state_limits(EstimatorSettings(), Layout((1, 2))) is None

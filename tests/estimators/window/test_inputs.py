@@ -17,7 +17,7 @@ NOISE = np.full(3, 0.01)
 
 def history(hold: bool, accels: dict[int, float], slot: int = 1) -> InputHistory:
     """A history of two agents; ``accels`` by tick, the same on all axes, of one of them."""
-    made = InputHistory(2, OTHER, hold=hold)
+    made = InputHistory(np.full(2, OTHER), hold=hold)
     for tick, value in accels.items():
         made.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)
     return made
@@ -44,7 +44,7 @@ def test_an_unknown_input_is_held_with_a_variance_that_grows_with_its_age() -> N
 def test_a_held_input_fades_and_its_variance_is_that_of_the_fading_guess() -> None:
     # GIVEN an agent whose acceleration halves every tick, and one guess that knows so and one that does not
     halving = {tick: 0.5**tick for tick in range(5)}
-    fading, staying = InputHistory(1, OTHER, hold=True, fade=0.5), InputHistory(1, OTHER, hold=True)
+    fading, staying = InputHistory(np.array([OTHER]), hold=True, fade=0.5), InputHistory(np.array([OTHER]), hold=True)
     for tick, value in halving.items():
         for made in (fading, staying):
             made.insert(input_rows(tick, 0, np.full(3, value), NOISE), 0)
@@ -107,7 +107,8 @@ def test_in_another_fleet_a_history_knows_the_same_of_the_same_agents() -> None:
     # GIVEN a history of two agents, WHEN they go on in another order with a third between them
     made = history(True, {4: 0.5, 5: 0.6}, slot=1)
     made.insert(input_rows(5, 0, np.full(3, 0.1), NOISE), 0)
-    made.change_members(MemberChange.between(Layout((1, 2)), (2, 3, 1), 1, {3: (np.zeros(6), np.eye(6))}))
+    change = MemberChange.between(Layout((1, 2)), (2, 3, 1), 1, {3: (np.zeros(6), np.eye(6))})
+    made.change_members(change, np.full(3, OTHER))
     # THEN it knows the same of them, and goes on
     for tick, slot, value in ((5, 2, 9.0), (4, 1, 0.7)):
         made.insert(input_rows(tick, slot, np.full(3, value), NOISE), 0)

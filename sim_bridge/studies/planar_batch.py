@@ -38,7 +38,7 @@ def solve_batch(recording: StudyInput, *, biases: bool) -> BatchSolution:
     n, count = len(recording.agents), recording.ticks + 1
     pairs = [(a, b) for a in range(n) for b in range(a + 1, n)] if biases else []
     problem = _Problem(recording, pairs)
-    state = np.zeros(count * n * 2 + len(pairs))
+    state: Floats = np.zeros(count * n * 2 + len(pairs))
     state[: count * n * 2] = problem.dead_reckoned()
     for _ in range(ITERATIONS):
         step = problem.step(state)

@@ -42,6 +42,7 @@ from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
 from agent.fleet.tracking import FleetTracker, in_layout
 from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tell, estimate_message
+from agent.sensing.climb import without_climb
 from agent.sensing.gps_antenna import at_body
 from agent.sensing.latency import GpsLatency
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
@@ -111,6 +112,8 @@ class AgentCore:
         self._barrier: RoundBarrier[Information | WindowStates] = RoundBarrier(max(self._rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
+        self._climb_mps: float | None = None
+        """Own rate of climb or descent by the last estimate."""
         self._fix_interval_s: float | None = None
         """Between own fixes, on average."""
         self._tick: int | None = None
@@ -148,8 +151,10 @@ class AgentCore:
         if not self._plausible("gps", sample.t_s, now_s):
             return
         self._note_fix(now_s)
-        corrected = self.gps_latency.on_fix(self._at_body(sample))
-        for record in gps_measurements(self._agent_id, corrected, self._period_s, self._config.sensors):
+        corrected = without_climb(self.gps_latency.on_fix(self._at_body(sample)), self._climb_mps)
+        position, *others = gps_measurements(self._agent_id, corrected, self._period_s, self._config.sensors)
+        self._count_own("gps", position)
+        for record in others:
             self._on_own_record(record)
 
     def _at_body(self, sample: GpsSample) -> GpsSample:
@@ -167,10 +172,10 @@ class AgentCore:
         elif not self._plausible("range", sample.t_s, now_s):
             return
         elif anchor_m is None:
-            self._on_own_record(range_measurement(sample, self._period_s, self._config.sensors))
+            self._count_own("range", range_measurement(sample, self._period_s, self._config.sensors))
         else:
             arm = own_arm(self._own, sample.tag, self.timeline.orientation_at(sample.t_s))
-            self._on_own_record(anchor_measurement(sample, anchor_m, arm, self._period_s, self._config.sensors))
+            self._count_own("range", anchor_measurement(sample, anchor_m, arm, self._period_s, self._config.sensors))
 
     def on_packet(self, received: Received, now_s: float) -> None:
         """A neighbour's message, opened and checked by the transport."""
@@ -203,10 +208,21 @@ class AgentCore:
         self.counters[f"{sensor}: wrong time"] += 1
         return False
 
-    def _on_own_record(self, record: Measurement) -> None:
+    def _count_own(self, sensor: str, record: Measurement) -> None:
+        """Take in what a sample of a sensor has become, and count whether it is of any use."""
+        if not self._on_own_record(record):
+            self.counters[f"{sensor}: refused"] += 1
+        elif self._tick is not None and record.tick < self._tick - self._config.estimator.window:
+            self.counters[f"{sensor}: late"] += 1
+        else:
+            self.counters[f"{sensor}: used"] += 1
+
+    def _on_own_record(self, record: Measurement) -> bool:
+        """Take in a record of an own sensor, if the wire can hold it and it is none that came before."""
         rounded = self.records.add_own(record)
         if rounded is not None:
             self.fleet.note(rounded, rounded.tick if self._tick is None else self._tick)
+        return rounded is not None
 
     def _on_measurements(self, sender: int, message: Measurements) -> None:
         assert self._tick is not None
@@ -393,6 +409,7 @@ class AgentCore:
         changed = self.health.update(found, now_s)
         if self.fleet.started:
             self.far_field.note_own(estimate, own)
+            self._climb_mps = abs(float(estimate.mean[own][5]))
         reports = self.far_field.packet(self._tick)
         outputs += (ready, Tell(message))  # nothing fails from here on: no tick has two estimates
         if reports is not None:

@@ -105,6 +105,8 @@ class MeasurementStore:
         self.refused: Counter[str] = Counter()
         self.unturned = 0
         """Ranges that were used without knowing where their antennas pointed."""
+        self.unused_ranges = 0
+        """Own ranges that waited in vain for both ends to be located."""
 
     def add_own(self, record: Measurement) -> Measurement | None:
         """Take in a record of our own sensors; it comes back as the wire rounds it, ``None`` if refused."""
@@ -199,6 +201,9 @@ class MeasurementStore:
         rows = [record for record in self._rows if record.observer in wanted and _far_end(record) in wanted]
         inputs = [record for record in self._inputs if record.observer in wanted]
         self.refused["beyond the joint state"] += len(self._rows) + len(self._inputs) - len(rows) - len(inputs)
+        if len(rows) < len(self._rows):
+            kept = set(map(id, rows))
+            self._count_ranges(record for record in self._rows if id(record) not in kept)
         self._rows, self._inputs = rows, inputs
 
     def forget(self, tick: int) -> None:
@@ -207,6 +212,7 @@ class MeasurementStore:
         waiting = [record for record in self._rows if record.tick >= first]
         if len(waiting) < len(self._rows):
             self.refused["not located"] += len(self._rows) - len(waiting)
+            self._count_ranges(record for record in self._rows if record.tick < first)
         self._rows = waiting
         self._inputs = [record for record in self._inputs if record.tick >= first]
         self._arms.forget(first)
@@ -214,6 +220,11 @@ class MeasurementStore:
             self._kept.pop(old)
             self._acked.pop(old, None)
             self._to_send.pop(old, None)
+
+    def _count_ranges(self, let_go: Iterable[Measurement]) -> None:
+        """Count the own ranges among what is let go unused."""
+        for record in let_go:
+            self.unused_ranges += isinstance(record, RangeMeasurement) and record.observer == self._agent_id
 
     def packet(self, tick: int, exchange: int, neighbours: frozenset[int]) -> Measurements:
         """What ``neighbours`` get in an exchange: what one of them may lack, newest first, then echoes.

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 from agent.config.tables import SensorsTable
 from agent.mavlink.boot_times import WRAP_MS_S, WRAP_US_S, turns
 from agent.mavlink.codec import Message, mavlink
+from agent.mavlink.components import SENSORS
 from agent.mavlink.utc_stamps import UtcStamps, unrolled
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.latency import Stamp, gps_prior, imu_latency_s
@@ -96,6 +97,8 @@ class SampleAdapter:
         self.flavour = "other"
         """``ardupilot``, ``px4`` or ``other``, set by the owner once the autopilot is known: only ArduPilot scales
         RAW_IMU, and the sensors of each are late in their own way."""
+        self.received: Counter[str] = Counter()
+        """Messages of sensors, by kind."""
         self.skipped: Counter[str] = Counter()
         self.noted: Counter[str] = Counter()
         self.reset()
@@ -119,6 +122,9 @@ class SampleAdapter:
     def convert(self, message: Message, arrival_s: float) -> Sample | None:
         """The sample of a message that arrived at fleet time ``arrival_s``; ``None`` if it gives none."""
         converter = _CONVERTERS.get(message.get_msgId())
+        kind = SENSORS.get(message.get_msgId())
+        if kind is not None:
+            self.received[kind] += 1
         return None if converter is None else converter(self, message, arrival_s)
 
     # --- IMU and attitude ----------------------------------------------------------------------------------
@@ -241,6 +247,7 @@ class SampleAdapter:
             fix_type=message.fix_type,
             latency=gps_prior(self.flavour, kind, self._sensors),
             receiver=receiver.number,
+            speed_may_be_norm=self.flavour == "px4",
         )
 
     def _fix_time(self, time_usec: int, arrival_s: float, receiver: _HeardReceiver) -> tuple[float | None, Stamp]:

@@ -68,6 +68,8 @@ class GpsSample:
     latency: LatencyPrior = NO_LATENCY
     receiver: int = 0
     shift_mps: Triple = (0.0, 0.0, 0.0)
+    speed_may_be_norm: bool = False
+    """Whether the length of ``ground_velocity_mps`` may be that of the velocity in all three axes."""
 
 
 @dataclass(frozen=True, slots=True)

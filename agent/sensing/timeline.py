@@ -115,7 +115,11 @@ class _Limit:
 
 
 class Timeline:
-    """The IMU and attitude samples of the last moments; ``skipped`` counts those not used, by reason."""
+    """The IMU and attitude samples of the last moments.
+
+    Each sample is counted once, in ``used`` by sensor or in ``skipped`` by reason: one of the IMU when the tick that
+    it lies in is closed, or when it comes if that was before. ``waiting`` are those whose tick is not closed yet.
+    """
 
     def __init__(self, period_s: float, gravity_mps2: float, sensors: SensorsTable) -> None:
         self._period_s = period_s
@@ -125,27 +129,43 @@ class Timeline:
         self._attitudes: list[AttitudeSample] = []
         self._closed_until_s = -math.inf
         self._limit = _Limit()
+        self.used: Counter[str] = Counter()
         self.skipped: Counter[str] = Counter()
+
+    @property
+    def waiting(self) -> int:
+        """IMU samples that lie in no tick closed so far."""
+        return len(self._imu) - bisect_left(self._imu, self._closed_until_s, key=_time_of)
 
     def add_imu(self, sample: ImuSample) -> None:
         """Take in an IMU sample, in any order; those of an accelerometer at its limit are as good as none."""
         if self._limit.take(sample.specific_force_mps2):
-            self.skipped["imu: at its limit"] += 1
+            before = self.waiting
             self._imu = [kept for kept in self._imu if not self._limit.is_at(kept.specific_force_mps2)]
+            self.skipped["imu: at its limit"] += 1 + before - self.waiting
         elif sample.t_s < self._closed_until_s - self._sensors.imu_max_gap_s:
             self.skipped["imu: late"] += 1
         elif not _insert(self._imu, sample):
             self.skipped["imu: duplicate"] += 1
+        else:
+            self.used["imu"] += sample.t_s < self._closed_until_s  # it still lends itself to the next tick
+            self._make_room()
 
     def add_attitude(self, sample: AttitudeSample) -> None:
         """Take in an attitude sample, in any order."""
         if not _insert(self._attitudes, sample):
             self.skipped["attitude: duplicate"] += 1
+            return
+        self.used["attitude"] += 1
+        if len(self._attitudes) > MAX_SAMPLES:
+            del self._attitudes[0]
 
     def close(self, tick: int) -> TickInput:
         """The input of a tick, from what has come in so far; ticks are closed in ascending order."""
         start_s, end_s = tick * self._period_s, (tick + 1) * self._period_s
-        points = [(t, a) for t, a in self._accelerations(start_s, end_s) if a is not None]
+        accelerations = self._accelerations(start_s, end_s)
+        self._judge(accelerations, start_s, end_s)
+        points = [(t, a) for t, a in accelerations if a is not None]
         covered_s, integral = self._integral(points, start_s, end_s)
         self._closed_until_s = end_s
         self._forget(start_s - KEEP_S)
@@ -172,6 +192,24 @@ class Timeline:
         after = bisect_left(self._imu, t_s, key=_time_of)
         near = [s for s in self._imu[max(after - 1, 0) : after + 1] if abs(s.t_s - t_s) <= ATTITUDE_MAX_AGE_S]
         return min(near, key=lambda s: abs(s.t_s - t_s)).gyro_radps if near else (0.0, 0.0, 0.0)
+
+    def _judge(self, accelerations: list[tuple[float, Triple | None]], start_s: float, end_s: float) -> None:
+        """Count the IMU samples of a tick, and those before it that lie in none."""
+        first = bisect_left(self._imu, self._closed_until_s, key=_time_of)
+        left_out = bisect_left(self._imu, start_s, key=_time_of) - first
+        if left_out > 0:
+            self.skipped["imu: in no tick"] += left_out
+        inside = [a for t, a in accelerations if max(start_s, self._closed_until_s) <= t < end_s]
+        without = sum(a is None for a in inside)
+        if without:
+            self.skipped["imu: no attitude"] += without
+        self.used["imu"] += len(inside) - without
+
+    def _make_room(self) -> None:
+        """Let the oldest sample go where there are too many."""
+        if len(self._imu) > MAX_SAMPLES:
+            self.skipped["imu: more than can be held"] += self._imu[0].t_s >= self._closed_until_s
+            del self._imu[0]
 
     def attitude_at(self, t_s: float, gyro_radps: Triple) -> Quaternion | None:
         """The attitude at an instant; ``None`` without a sample close enough.
@@ -200,14 +238,11 @@ class Timeline:
     def _acceleration(self, sample: ImuSample) -> Triple | None:
         attitude = self.attitude_at(sample.t_s, sample.gyro_radps)
         if attitude is None:
-            self.skipped["imu: no attitude"] += 1
             return None
         north, east, down = rotated(attitude, sample.specific_force_mps2)
         return north, east, down + self._gravity_mps2
 
-    def _integral(
-        self, points: list[tuple[float, Triple]], start_s: float, end_s: float
-    ) -> tuple[float, Triple]:
+    def _integral(self, points: list[tuple[float, Triple]], start_s: float, end_s: float) -> tuple[float, Triple]:
         """Covered time in s and integral in m/s over a tick."""
         gap_s = self._sensors.imu_max_gap_s
         covered_s, north, east, down = 0.0, 0.0, 0.0, 0.0
@@ -234,7 +269,7 @@ class Timeline:
 
 
 def _insert(samples: list[_Sample], sample: _Sample) -> bool:
-    """Put a sample in its place; false if that instant is taken already. The oldest makes room."""
+    """Put a sample in its place; false if that instant is taken already."""
     if not samples or sample.t_s > samples[-1].t_s:  # as nearly all
         samples.append(sample)
     else:
@@ -242,8 +277,6 @@ def _insert(samples: list[_Sample], sample: _Sample) -> bool:
         if samples[index].t_s == sample.t_s:
             return False
         samples.insert(index, sample)
-    if len(samples) > MAX_SAMPLES:
-        del samples[0]
     return True
 
 

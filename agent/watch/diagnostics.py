@@ -73,6 +73,9 @@ def _rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
+_ON_THE_LINK = ("imu", "attitude", "gps")
+
+
 def counters_of(onboard: OnboardAgent) -> dict[str, int]:
     """Everything that the agent counts, by name; names of the same thing share their first word."""
     core, session, uwb, opener = onboard.core, onboard.autopilot, onboard.uwb, onboard.opener
@@ -101,6 +104,7 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
         ("mavlink refused ", {} if decoder.signing is None else dict(decoder.signing.refused)),
         ("skipped ", dict(session.samples.skipped)),
         ("noted ", dict(session.samples.noted)),
+        ("", _samples(onboard)),
         ("skipped ", dict(core.timeline.skipped)),
         ("skipped uwb ", dict(uwb.skipped)),
         ("gps latency ", dict(core.gps_latency.counters)),
@@ -111,6 +115,22 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
     for prefix, table in tables:
         counters |= {f"{prefix}{name}"[:MAX_NAME]: count for name, count in table.items()}
     return counters
+
+
+def _samples(onboard: OnboardAgent) -> dict[str, int]:
+    """What came of each sensor (messages of the autopilot's link, or samples made elsewhere), and what was used.
+
+    The rest is in the counters of what was skipped, at a wrong time or late.
+    """
+    core, told = onboard.core, onboard.autopilot.samples.received
+    counted = {f"{kind}: received": told[kind] or core.counters[f"{kind}: samples"] for kind in _ON_THE_LINK}
+    counted |= {f"{kind}: used": core.timeline.used[kind] for kind in ("imu", "attitude")}
+    counted["range: received"] = (
+        core.counters["range: samples"] + core.counters["range: not ours"] + sum(onboard.uwb.skipped.values())
+    )
+    counted["imu: waiting"] = core.timeline.waiting
+    counted["range: not located"] = core.records.unused_ranges
+    return counted
 
 
 def gauges_of(onboard: OnboardAgent, now_s: float) -> dict[str, float]:

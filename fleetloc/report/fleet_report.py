@@ -142,12 +142,24 @@ def counted_sensors(total: Counter[str]) -> dict[str, dict[str, Any]]:
 
 
 def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:
-    """Samples used and not."""
-    wrong_time = total[f"{name}: wrong time"]
-    skipped = sum(n for key, n in total.items() if key.startswith(f"skipped {left_out}"))
+    """What came of a sensor and what became of it; each sample is in one of the numbers but ``received``."""
+    reasons = {
+        key.removeprefix(f"skipped {left_out}").lstrip(": "): count
+        for key, count in total.items()
+        if key.startswith(f"skipped {left_out}") and count
+    }
+    late = total[f"{name}: late"] + reasons.pop("late", 0)
+    for reason in ("wrong time", "refused", "not ours", "not located"):
+        if total[f"{name}: {reason}"]:
+            reasons[reason] = reasons.get(reason, 0) + total[f"{name}: {reason}"]
+    if total[f"{name}: waiting"]:
+        reasons["in no tick"] = reasons.get("in no tick", 0) + total[f"{name}: waiting"]
     return {
-        "used": total[f"{name}: samples"] - wrong_time,
-        "skipped": skipped + wrong_time,
+        "received": total[f"{name}: received"] + reasons.get("dropped on request", 0),
+        "used": total[f"{name}: used"] - total[f"{name}: not located"],
+        "skipped": sum(reasons.values()),
+        "skipped_by_reason": reasons,
+        "late": late,
         "latency_s": None,
         "latency_sigma_s": None,
     }

@@ -92,6 +92,13 @@ def cautions(figures: dict[str, Any]) -> list[str]:
     for agent in figures["agents"]:
         if agent["first_estimate_s"] is None:
             sentences.append(f"drone {agent['id']} ({agent['log']}) never had an estimate: no fixes, or none in time")
+        gps = agent["sensors"]["gps"]
+        if gps["late"]:
+            window_s = figures["config"]["estimator"]["window"] * figures["config"]["fleet"]["period_s"]
+            sentences.append(
+                f"{gps['late']} of {gps['received']} fixes of drone {agent['id']} came later than the window of "
+                f"{window_s:.1f} s: --arrival stamped, or a larger estimator.window"
+            )
         estimated = agent["ticks_expected"] - agent["ticks_without_estimate"]
         if 0 < agent["ticks_with_truth"] < MOSTLY * estimated:
             known = f"{agent['ticks_with_truth']} of its {estimated} estimates"

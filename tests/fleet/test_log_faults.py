@@ -19,7 +19,7 @@ from fleetloc.report.replay_tables import cautions
 from fleetloc.run.replay_setup import NO_PLACE
 from sim_bridge.replay.logs.events import LogError
 from tests.agent.conftest import fleet_config
-from tests.support.log_faults import FAULTY, flown, replayed
+from tests.support.log_faults import FAULTY, counted, flown, replayed
 from tests.support.logs import read
 
 IMU, ATTITUDE, GPS = 400, 400, 100
@@ -32,8 +32,20 @@ def used(figures: dict[str, Any], agent: int = 0) -> tuple[int, ...]:
     return tuple(sensors[kind]["used"] for kind in ("imu", "attitude", "gps"))
 
 
+def assert_counts_close(figures: dict[str, Any]) -> None:
+    """Each sample is counted once: used, skipped for a reason, or late; and what the log gave is what came."""
+    for agent in figures["agents"]:
+        for sensor in agent["sensors"].values():
+            assert sensor["skipped"] == sum(sensor["skipped_by_reason"].values())
+            assert sensor["received"] == sensor["used"] + sensor["skipped"] + sensor["late"]
+        given = next(log for log in figures["logs"] if log["file"] == agent["log"])["used"][str(agent["system_id"])]
+        for kind in ("imu", "attitude", "gps"):
+            assert agent["sensors"][kind]["received"] == given.get(kind, 0)
+
+
 def assert_flown_well(figures: dict[str, Any], agent: int = 0, rmse_m: tuple[float, float] = (0.15, 0.45)) -> None:
     """The whole flight was estimated, and neither badly nor suspiciously well."""
+    assert_counts_close(figures)
     found = figures["agents"][agent]
     assert found["ticks_without_estimate"] <= 25
     assert rmse_m[0] <= found["position_rmse_m"] <= rmse_m[1]
@@ -166,6 +178,7 @@ BIN = (750, 375, 75)
 
 
 def assert_near_its_autopilot(figures: dict[str, Any], agent: int = 0) -> None:
+    assert_counts_close(figures)
     found = figures["agents"][agent]
     assert found["ticks_without_estimate"] <= 25
     assert 0.1 <= found["to_autopilot_horizontal_rms_m"] <= 0.4
@@ -242,3 +255,73 @@ def test_log_without_any_place_says_so(tmp_path: Path) -> None:
     assert used(figures) == (IMU, ATTITUDE, 0)
     assert figures["origin"] == NO_PLACE
     assert "no log tells a place: there is no origin, no home and no fix in them" in cautions(figures)
+
+
+# --- what is wrong in the air ----------------------------------------------------------------------------------
+
+
+def test_fixes_later_than_the_window_are_counted_and_the_remedy_told(tmp_path: Path) -> None:
+    figures = replayed(tmp_path / "logged", "late_fixes.tlog")
+    assert_counts_close(figures)
+    gps = figures["agents"][0]["sensors"]["gps"]
+    assert (gps["received"], gps["skipped"]) == (150, 0)
+    assert 60 <= gps["late"] <= 130
+    (sentence,) = (each for each in cautions(figures) if "later than the window" in each)
+    assert sentence.startswith(f"{gps['late']} of 150 fixes of drone 1")
+    assert "--arrival stamped" in sentence
+    stamped = replayed(tmp_path / "stamped", "late_fixes.tlog", arrival="stamped")
+    assert stamped["agents"][0]["sensors"]["gps"]["late"] == 0
+    assert stamped["agents"][0]["position_rmse_m"] < figures["agents"][0]["position_rmse_m"]
+
+
+def test_speed_that_may_be_a_norm_on_the_link_is_not_taken_for_a_motion_over_ground(tmp_path: Path) -> None:
+    """GIVEN a climb of 1.5 m/s, 0.25 m/s over ground, and a speed of 1.5 m/s along the course."""
+    figures = replayed(tmp_path, "px4_speed_is_norm.tlog")
+    assert used(figures) == (600, 600, 150)
+    assert_flown_well(figures, rmse_m=(0.3, 0.9))
+
+
+def test_fixes_100_m_off_for_seconds_are_held_back_and_an_alarm_is_raised(tmp_path: Path) -> None:
+    figures = replayed(tmp_path, "gps_glitch.tlog")
+    assert_counts_close(figures)
+    (agent,) = figures["agents"]
+    assert 0.15 <= agent["position_rmse_m"] <= 0.6
+    assert 0.02 <= agent["anees"] <= 1.5
+    assert 30 <= agent["ticks_alarm"] <= 120
+    assert agent["position_p95_m"] < 1.5
+
+
+def test_ranges_that_say_none_with_a_number_move_nobody(tmp_path: Path, pair: Path) -> None:
+    """GIVEN every twentieth range at the 65.535 m that 16-bit modules have for none."""
+    good, wrong = (
+        replayed(tmp_path / name, "ranges_a.tlog", "ranges_b.tlog", config=pair, ranges=f"{name}.csv.gz")
+        for name in ("ranges_good", "ranges_sentinel_65535")
+    )
+    for figures in (good, wrong):
+        assert_counts_close(figures)
+        assert figures["fleet"]["ranges"]["delivered"] == 560
+    for before, found in zip(good["agents"], wrong["agents"], strict=True):
+        assert found["sensors"]["range"]["received"] == 280
+        assert 0.1 <= found["position_rmse_m"] <= 1.3 * before["position_rmse_m"]
+        assert 0.02 <= found["anees"] <= 1.5
+
+
+@pytest.mark.parametrize(
+    ("name", "messages"),
+    [
+        ("gps2_only.tlog", (400, 400, 200)),
+        ("scaled_imu_only.tlog", (400, 400, 100)),
+        ("utc_fixes_recorder_1s_behind.tlog", (400, 400, 100)),
+        ("late_fixes.tlog", (600, 600, 150)),
+        ("sim_at_0.3.tlog", (400, 400, 100)),
+        ("gps_glitch.tlog", (800, 800, 200)),
+    ],
+)
+def test_a_daemon_counts_each_message_of_its_sensors_once(
+    config: FleetConfig, name: str, messages: tuple[int, int, int]
+) -> None:
+    sensors = counted(config, name)
+    for kind, sent in zip(("imu", "attitude", "gps"), messages, strict=True):
+        found = sensors[kind]
+        assert found["received"] == found["used"] + found["skipped"] + found["late"]
+        assert 0.9 * sent <= found["received"] <= sent  # those before the first heartbeat are of nobody known

@@ -11,6 +11,8 @@ from agent.config.documents import Override
 from agent.config.tables import FleetConfig
 from agent.mavlink.session import AutopilotSession
 from agent.sensing.samples import Sample
+from agent.watch.diagnostics import counters_of
+from fleetloc.report.fleet_report import counted_sensors
 from fleetloc.report.replay_figures import load_results, report_figures
 from fleetloc.run import replay_run
 from fleetloc.run.replay_setup import Options, prepare
@@ -50,6 +52,15 @@ def frames_of(name: str) -> Iterator[tuple[float, bytes]]:
         assert end > begin
         yield (int.from_bytes(data[at:begin], "big") - first_us) * 1e-6, data[begin:end]
         at = end
+
+
+def counted(config: FleetConfig, name: str, from_s: float = 100.0) -> dict[str, dict[str, Any]]:
+    """What a daemon that gets the frames of a telemetry log counts of its sensors."""
+    onboard = onboard_of(config, linked=True)
+    for t_s, frame in frames_of(name):
+        onboard.on_mavlink(frame, from_s + t_s)
+        onboard.advance(from_s + t_s)
+    return counted_sensors(Counter(counters_of(onboard)))
 
 
 def flown(config: FleetConfig, name: str, from_s: float = 100.0) -> tuple[AutopilotSession, list[Sample]]:

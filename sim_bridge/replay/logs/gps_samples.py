@@ -75,6 +75,7 @@ def gps_sample(
         fix_type=fix.fix_type,
         latency=gps_prior(flavour, "boot", sensors),
         receiver=receiver,
+        speed_may_be_norm=flavour == "px4" and fix.ground_velocity_mps is None,
     )
 
 

@@ -260,6 +260,7 @@ def test_the_second_receiver_serves_while_the_first_has_no_fix() -> None:
     assert made.skipped == {"gps: not the first one": 1}
     assert convert(made, gps(fix_type=1)) is None
     second = convert(made, gps2(time_usec=99_950_000))
+    assert second.receiver == 1
     assert second.position_m[0] == pytest.approx(FRAME.ned(47.0003, 8.0002, 412.5)[0], abs=1e-6)
     assert made.fix_type == 3
     assert convert(made, gps(time_usec=99_960_000)) is not None

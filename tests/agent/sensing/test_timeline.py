@@ -148,7 +148,29 @@ def test_without_attitude_imu_samples_are_worth_nothing() -> None:
     for i in range(12):
         made.add_imu(ImuSample(1.0 + 0.01 * i, (0, 0, -GRAVITY), (0, 0, 0)))
     assert made.close(10).coverage == 0.0
-    assert made.skipped["imu: no attitude"] > 0
+    assert made.skipped == {"imu: no attitude": 10}
+    assert made.waiting == 2
+
+
+@given(
+    st.lists(st.tuples(st.floats(0.0, 3.0), st.booleans()), max_size=150), st.sets(st.integers(0, 29), max_size=12)
+)
+def test_each_sample_is_counted_once(added: list[tuple[float, bool]], closed: set[int]) -> None:
+    """GIVEN samples in any order, some again and some without attitudes, and ticks of which some are left out."""
+    made, rng = timeline(), random.Random(6)
+    ticks = sorted(closed)
+    for t_s, turned in added:
+        made.add_imu(ImuSample(t_s, (rng.gauss(0.0, 0.3), 9.0, -GRAVITY), (0, 0, 0)))
+        if turned:
+            made.add_attitude(AttitudeSample(t_s, (1, 0, 0, 0)))
+        if ticks and rng.random() < 0.1:
+            made.close(ticks.pop(0))
+    for tick in ticks:
+        made.close(tick)
+    imu = sum(count for reason, count in made.skipped.items() if reason.startswith("imu"))
+    attitude = sum(count for reason, count in made.skipped.items() if reason.startswith("attitude"))
+    assert made.used["imu"] + imu + made.waiting == len(added)
+    assert made.used["attitude"] + attitude == sum(turned for _, turned in added)
 
 
 def test_samples_of_closed_ticks_are_counted() -> None:
@@ -214,7 +236,7 @@ def test_an_accelerometer_at_its_limit_is_as_good_as_none(axis: int, sign: float
         if i % 10 == 6 and i > 10:  # as a tick is closed some time after its end
             closed.append(made.close(i // 10 - 1))
     # THEN the accelerations of that second are unknown, its first samples among them, and no others
-    assert made.skipped["imu: at its limit"] == 95
+    assert made.skipped["imu: at its limit"] == 100
     for each in closed:
         assert each.coverage == (pytest.approx(0.0 if 10 <= each.tick < 20 else 1.0, abs=0.5))
         assert max(map(abs, each.accel_mps2)) < 1.0
@@ -242,4 +264,4 @@ def test_an_imu_without_noise_that_stands_still_or_turns_is_not_at_its_limit() -
     made = timeline()
     fill(made, 0.0, 0.5, (0.0, 0.0, 0.0))
     assert made.close(4).coverage == pytest.approx(1.0, abs=1e-6)
-    assert not made.skipped
+    assert made.skipped == {"imu: in no tick": 40}  # the ticks before were never closed

@@ -75,6 +75,7 @@ def make_run(directory: Path, north_mps: float = 0.0) -> Any:
 def outcome() -> RunOutcome:
     life = {"packets sent": 100, "packets received": 50, "measurements: late": 2, "information: late": 3}
     life |= {"rejected stale": 1, "gps: samples": 40, "gps: wrong time": 4, "skipped gps: no fix": 6}
+    life |= {"gps: received": 46, "gps: used": 34, "gps: late": 2}
     lives = {1: [Diagnostics(1, "ok", (), life, {"cpu_fraction": 0.5}), Diagnostics(1, "ok", (), life)]}
     use = {1: Use(1.0, 3.0, 20.0, 210.0)}
     return RunOutcome(wall_s=21.0, deaths=[Death("agent 1", 10.0, "killed by SIGKILL: <b>")], use=use, lives=lives)
@@ -129,7 +130,9 @@ def test_counters_of_all_lives_are_added(figures: dict[str, Any]) -> None:
         "sent": 200, "received": 100, "lost": 0, "injected_losses": 0, "late": 10, "rejected": {"stale": 2},
     }  # fmt: skip
     gps = agent["sensors"]["gps"]
-    assert (gps["used"], gps["skipped"], gps["latency_s"]) == (2 * 36, 2 * 10, None)
+    assert (gps["received"], gps["used"], gps["late"], gps["latency_s"]) == (2 * 46, 2 * 34, 2 * 2, None)
+    assert gps["skipped_by_reason"] == {"no fix": 2 * 6, "wrong time": 2 * 4}
+    assert gps["skipped"] == 2 * 10
     assert figures["fleet"]["packets"]["rejected"] == {"stale": 2}
 
 

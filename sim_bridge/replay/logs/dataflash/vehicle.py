@@ -169,7 +169,7 @@ class DataflashVehicle:
         """The samples of a record of log time ``t_s``."""
         made: list[LogSample] = []
         for receiver, fix in self._pairs.add(name, values, t_s):
-            gps = self._gps(fix, t_s)
+            gps = self._gps(fix, t_s, receiver)
             if gps is None:
                 self._choice.without_fix(receiver)
             elif self._choice.takes(receiver, t_s):
@@ -205,7 +205,7 @@ class DataflashVehicle:
             return self._skip("attitude: not finite or out of range")
         return AttitudeSample(t_s, from_euler(*map(math.radians, angles)))
 
-    def _gps(self, values: Values, now_s: float) -> LogSample | None:
+    def _gps(self, values: Values, now_s: float, receiver: int) -> LogSample | None:
         point = point_of(values)
         if point is None:
             return self._skip("gps: no position")
@@ -231,7 +231,7 @@ class DataflashVehicle:
             down_mps=values.get("VZ"),
             speed_sigma_mps=values.get("SAcc"),
         )
-        sample = gps_sample(fix, self._frame, "ardupilot", self._sensors, values.get("I", 0))
+        sample = gps_sample(fix, self._frame, "ardupilot", self._sensors, receiver)
         return sample if isinstance(sample, GpsSample) else self._skip(sample)
 
     # --- the autopilot's estimate ----------------------------------------------------------------------------

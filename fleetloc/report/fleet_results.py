@@ -7,6 +7,7 @@ user had; ticks before the first estimate have none, and count in the availabili
 from __future__ import annotations
 
 import itertools
+import math
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -156,7 +157,8 @@ def _served(
 
 def _error(entries: NDArray[np.void], truth: Truth, when: Floats) -> Floats:
     """Of the drones' states ``(T, 6n)``; targets stand behind them, and the truth does not know them."""
-    known = truth.at(when).reshape(len(entries), -1)
+    known = truth.at(when)
+    known = known.reshape(len(entries), math.prod(known.shape[1:]))  # -1 would not do for a drone without ticks
     return np.asarray(entries["mean"][:, : known.shape[1]] - known, np.float64)
 
 

@@ -229,10 +229,16 @@ def partition(
 
 
 def awareness(
-    test: Annotated[str, typer.Option(help="1, 2, 3-under, 3-ahead, 4-under, 4-ahead; separated by commas.")] = "1",
+    test: Annotated[
+        str, typer.Option(metavar="LIST", help="1, 2, 3-under, 3-ahead, 4-under, 4-ahead; separated by commas.")
+    ] = "1",
     graph: Annotated[Literal["cycle", "ladder", "chain"], typer.Option(help="Who hears whom.")] = "cycle",
-    kinds: Annotated[str, typer.Option(help="Of estimators, separated by commas.")] = "consensus_mhe,dmhe_shared",
-    rounds: Annotated[str, typer.Option(help="Consensus rounds of a tick, separated by commas.")] = "2,6,10",
+    kinds: Annotated[
+        str, typer.Option(metavar="LIST", help="Of estimators, separated by commas.")
+    ] = "consensus_mhe,dmhe_shared",
+    rounds: Annotated[
+        str, typer.Option(metavar="LIST", help="Consensus rounds of a tick, separated by commas.")
+    ] = "2,6,10",
     window: Annotated[int | None, typer.Option(min=1, max=64, help="Ticks; absent: the kind's own.")] = None,
     loss: Annotated[float, typer.Option(min=0.0, max=0.99, help="Of all packets.")] = 0.0,
     runs: Runs = 5,
@@ -241,7 +247,7 @@ def awareness(
     out: OutFolder = None,
     json_file: JsonFile = None,
 ) -> None:
-    """Nine drones on a sparse graph: who knows where the others are, and a target?
+    """Nine drones, a sparse graph and a target: who knows what.
 
     1: drone 1 hovers, the others fly. 2: two links fail for 30 s. 3 and 4: a fixed and a moving target.
     """

@@ -102,6 +102,7 @@ def test_rows_without_a_place_are_refused() -> None:
     late["offset_s"] = 0.01
     twice[1] = twice[0]
     speed["kind"][0] = Kind.SPEED
+    speed["x"][0] = speed["y"][0] = speed["z"][0] = 0.0  # of an antenna that is where the IMU is
     for rows, expected in ((late, "instant"), (twice, "two measurements"), (speed, "NED axes")):
         with pytest.raises(ValueError, match=expected):
             staged(problem._replace(rows=rows), EDGES)

@@ -252,7 +252,7 @@ def test_with_outliers_it_is_a_point_where_reweighting_changes_nothing(seed: int
 
 @pytest.mark.parametrize("seed", [2, 6, 10])
 def test_where_nothing_is_far_off_robust_is_least_squares(seed: int) -> None:
-    # GIVEN a window whose noise is half of what it is said to be; what linearisations of speeds miss counts when robust
+    # GIVEN a window whose noise is half of what it is said to be. Of speeds, what is missed counts with robust
     kinds = (Kind.POSITION, Kind.VELOCITY, Kind.RANGE, Kind.ANCHOR_RANGE)
     drawn = nth_window(seed, rows_per_agent=4, kinds=kinds)
     joint, table = drawn.joint(), drawn.window._rows

@@ -8,8 +8,8 @@ an interval of 0.2 s costs 2 cm at 4 m/s2. The median of a bin makes little of r
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from collections.abc import Container, Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -66,6 +66,11 @@ class Bin:
     pairs: Mapping[Pair, LeftOver]
     fix_variance_m2: Mapping[int, Vector]
     """``(3,)`` of the mean of a drone's fixes, as claimed."""
+
+    def without(self, agents: Container[int]) -> Bin:
+        """The same without the pairs of some drones."""
+        kept = {pair: each for pair, each in self.pairs.items() if not any(agent in agents for agent in pair)}
+        return self if len(kept) == len(self.pairs) else replace(self, pairs=kept)
 
 
 @dataclass(frozen=True, slots=True)

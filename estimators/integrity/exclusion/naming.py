@@ -86,6 +86,8 @@ class NamingMonitor:
         self._judge(now, tick)
         for agent in list(self.named):
             self._reconsider(agent, epochs)
+        # what a receiver said before it was named, and while it is, says nothing of it once it is taken back
+        self._bins = {number: each.without(self.named) for number, each in self._bins.items()}
 
     def _judge(self, now: Odds, tick: int) -> None:
         agent, lead = largest(now.receivers)

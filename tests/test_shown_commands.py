@@ -54,7 +54,7 @@ BEFORE = {page: ["keys init fleet.toml"] for page in ("operating.md", "security.
 ASIDE = {"security.md": {"keys add fleet.toml --id 4": "[[agents]]\nid = 4\nmavlink = 'udpin:127.0.0.1:14554'\n"}}
 """What a reader adds to ``fleet.toml`` before a command, as the page says."""
 
-FLOWN = {"agent_001": "first_state_002", "agent_002": "first_state_002", "agent_003": "first_state_003"}
+FLOWN = {"agent_001": "two_places_002", "agent_002": "two_places_002", "agent_003": "two_places_003"}
 """Flight logs kept of two drones, in the places of three."""
 
 

@@ -69,6 +69,8 @@ class _HeardReceiver:
     """How often the last fix has come again, with another time."""
     frozen: bool = False
     utc: UtcStamps = field(default_factory=UtcStamps)
+    on_boot_clock: bool = False
+    """Whether it has ever stamped a fix with the time since boot."""
 
 
 class SampleAdapter:
@@ -255,7 +257,9 @@ class SampleAdapter:
         if not time_usec:  # PX4 sends time 0 while its receiver does not know UTC: then arrival is all there is
             return arrival_s, "arrival"
         if time_usec <= UNIX_US:
-            return self._stamp(time_usec, arrival_s, "gps", WRAP_US_S), "boot"
+            t_s = self._stamp(time_usec, arrival_s, "gps", WRAP_US_S)
+            receiver.on_boot_clock = receiver.on_boot_clock or t_s is not None
+            return t_s, "boot"
         arrival_unix_s = arrival_s + self._epoch_unix_s
         unix_s = unrolled(time_usec * 1e-6, arrival_unix_s)
         if abs(unix_s - time_usec * 1e-6) > 1.0:
@@ -263,6 +267,9 @@ class SampleAdapter:
         shift_s = receiver.utc.shift_s(unix_s, arrival_unix_s)
         if shift_s == 0.0:
             return self._plausible(unix_s - self._epoch_unix_s, arrival_s, "gps"), "utc"
+        if shift_s is None and receiver.on_boot_clock:  # a single one is no other clock, but wrong
+            self.skipped["gps: wrong time"] += 1
+            return None, "utc"
         self.noted["fixes placed by arrival, as their UTC and our clock differ"] += 1
         if shift_s is None:
             return arrival_s, "arrival"

@@ -325,6 +325,15 @@ def test_utc_of_a_receiver_that_missed_a_turn_of_its_week_is_understood() -> Non
     assert made.noted == {"fixes whose weeks have rolled over": 1}
 
 
+def test_single_absurd_stamps_of_a_receiver_on_the_boot_clock_are_no_other_clock() -> None:
+    made = adapter()
+    assert convert(made, gps(time_usec=99_900_000)) is not None
+    for years in (3, 11, 40, -20):
+        stamp_us = round((EPOCH_UNIX_S + 499.9 + years * 31_557_600.0) * 1e6)
+        assert convert(made, gps(time_usec=stamp_us)) is None
+    assert made.skipped == {"gps: wrong time": 4}
+
+
 @given(st.integers(-32768, 32767), st.integers(-32768, 32767), st.integers(-32768, 32767))
 def test_raw_imu_scales_every_integer(x: int, y: int, z: int) -> None:
     message = mavlink.MAVLink_raw_imu_message(99_990_000, x, y, z, x, y, z, 0, 0, 0, 0, 0)

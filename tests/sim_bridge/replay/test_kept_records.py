@@ -10,7 +10,7 @@ from estimators.factory import make_estimator
 from sim_bridge.replay.flight_log_replay import replay_flight_log
 
 RECORDS = Path(__file__).parents[2] / "data" / "records"
-PRESENT = "first_state"
+PRESENT = "two_places"
 """Name of the logs that the present estimator flew."""
 KEPT = sorted(RECORDS.glob("*.mcap"))
 OLDER = [path for path in KEPT if not path.stem.startswith(PRESENT)]
@@ -32,3 +32,13 @@ def test_an_older_record_opens_and_replays_to_its_own_estimates(path: Path) -> N
     assert replay.contradicted == 0
     assert replay.max_mean_difference < OTHER_SOLVER_M
     assert replay.max_sigma_difference < OTHER_SOLVER_M
+
+
+@pytest.mark.parametrize("path", sorted(set(KEPT) - set(OLDER)), ids=lambda path: path.stem)
+def test_a_present_record_replays_bit_by_bit(path: Path) -> None:
+    [replay] = replay_flight_log([path], None, make_estimator)
+
+    assert replay.complete
+    assert replay.compared > 50
+    assert replay.max_mean_difference == 0.0
+    assert replay.max_sigma_difference == 0.0

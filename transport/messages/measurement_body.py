@@ -20,6 +20,7 @@ from __future__ import annotations
 import hashlib
 import math
 import struct
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass, field
@@ -89,7 +90,7 @@ class _Parts(NamedTuple):
 
 
 @dataclass(frozen=True)
-class _Record:
+class _Record(ABC):
     """What all kinds have: an ``observer``, the ``tick`` they belong to, and what follows from the fields."""
 
     kind: ClassVar[MeasurementKind]
@@ -119,9 +120,9 @@ class _Record:
         told = _TICK.pack(self.tick) + (self.wire or b"")
         return hashlib.blake2b(told, digest_size=DIGEST_BYTES).digest()
 
+    @abstractmethod
     def parts(self) -> _Parts:
         """The record's numbers."""
-        raise NotImplementedError
 
 
 @dataclass(frozen=True)

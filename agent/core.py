@@ -472,8 +472,14 @@ class AgentCore:
             location=roll.own_location if alone else (),
             contradictions=self._contradictions(estimate),
             timing=self.gps_latency.timing,
-            integrity=self.integrity.observe(estimate, self.fleet.present),
+            integrity=(*self.integrity.observe(estimate, self.fleet.present), *self._of_fleet()),
         )
+
+    def _of_fleet(self) -> tuple[Finding, ...]:
+        """What the fleet's estimate had to leave out or give up, about ids, ``None`` for the own drone."""
+        assert self._tick is not None
+        found = self.fleet.findings(self._tick)
+        return tuple(replace(each, about=None) if each.about == self._agent_id else each for each in found)
 
     def _contradictions(self, estimate: Estimate) -> tuple[Finding, ...]:
         """Whose fixes contradict the rest, by id, ``None`` for the own ones; counted."""

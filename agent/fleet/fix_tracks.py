@@ -9,7 +9,7 @@ import numpy as np
 from agent.config.tables import FleetConfig
 from agent.fleet.motions import Motions
 from agent.sensing.samples import Triple
-from estimators.integrity.thresholds import FIX_MEMORY_TICKS
+from estimators.integrity.thresholds import FAR_M, FIX_MEMORY_TICKS
 from estimators.model.gaussian import Prior
 from estimators.model.measurements import Matrix, Vector
 from transport.messages.measurement_body import Measurement, PositionMeasurement, VelocityMeasurement
@@ -54,6 +54,9 @@ class FixTracks:
         of it by their slope, so that a speed or range is not linearised about a direction that nothing is known of.
         """
         fixes = [fix for fix in self._fixes.get(agent_id, ()) if at_tick - FIX_MEMORY_TICKS <= fix.tick < at_tick]
+        if fixes:  # one that is far from all others would draw the line to itself
+            middle = np.median([fix.position_m for fix in fixes], axis=0)
+            fixes = [fix for fix in fixes if np.linalg.norm(fix.position_m - middle) <= FAR_M]
         if self._count[agent_id] < self._enough or len(fixes) < 2:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)

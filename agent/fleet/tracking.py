@@ -18,10 +18,14 @@ from agent.fleet.fix_tracks import POSITION_SIGMA_M, VELOCITY_SIGMA_MPS
 from agent.fleet.joint_choice import JointChoice
 from agent.fleet.measurement_store import MeasurementStore
 from agent.fleet.membership import Membership
+from agent.fleet.sieve import Sieve
 from agent.watch.integrity_watch import IntegrityWatch
 from estimators.consensus.mapping import mapped_path, mapped_payload
 from estimators.estimator import Estimate, Estimator, Payload, SolverReport, Status
+from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.innovations import Innovations
+from estimators.integrity.range_geometry import GeometryMonitor
+from estimators.integrity.thresholds import BEGUN_ANEW_TOLD_S, FAULTS_IN_A_ROW
 from estimators.model.gaussian import Prior
 from estimators.model.layout import STATES_PER_AGENT, Layout, block, states_of
 from estimators.model.measurements import InputTable, Matrix, Vector, empty_inputs, input_rows
@@ -80,6 +84,11 @@ class FleetTracker:
         self._estimator: Estimator | None = None
         self._good: _Good | None = None
         self._since_s: float | None = None
+        self._faults = 0
+        """In a row."""
+        self._sieve = Sieve(agent_id, self._period_s, counters)
+        self._anew: tuple[int, str] | None = None
+        """When and why the estimate was begun from nothing last."""
         self.roll = Membership(config, agent_id)
         self._choice = JointChoice(config, agent_id)
         self.present: tuple[int, ...] = ()
@@ -99,6 +108,13 @@ class FleetTracker:
         """Rows and inputs that came too late for the estimator's window."""
         return 0 if self._estimator is None else self._estimator.dropped
 
+    def findings(self, tick: int) -> tuple[Finding, ...]:
+        """Who measured what cannot be, by id; and whether the estimate was begun anew of late."""
+        found = tuple(replace(each, detail=_measured_by(each.about, self._agent_id)) for each in self._sieve.findings)
+        if self._anew is None or tick - self._anew[0] > BEGUN_ANEW_TOLD_S / self._period_s:
+            return found
+        return (*found, Finding(What.BEGUN_ANEW, Gravity.ALARM, self._agent_id, detail=self._anew[1]))
+
     def note(self, record: Measurement, tick: int) -> None:
         """A record, own or heard, at the current tick."""
         self.roll.note(record, tick)
@@ -110,15 +126,19 @@ class FleetTracker:
         self.roll.wanted = self._choice.choose(tick, records.neighbourhood)
         if self.roll.wanted is not None:
             records.let_go_beyond(self.roll.wanted)
+        lost = self._lost(tick)
+        if self._agent_id in lost:
+            self._begin_anew(tick, "against its own fixes")
         if self._estimator is None:
             if not self._start(tick, now_s):
                 records.forget(tick)
                 return False
             rows, inputs = records.take(tick, self.roll.members, self.roll.usable(tick))
-            rows, inputs = rows[rows["tick"] == tick], inputs[:0]
+            rows, inputs = self._sieve.passed(tick, self.roll.members, rows[rows["tick"] == tick], inputs[:0])
         else:
-            self._change(tick)
+            self._change(tick, lost)
             rows, inputs = records.take(tick, self.roll.members, self.roll.usable(tick))
+            rows, inputs = self._sieve.passed(tick, self.roll.members, rows, inputs)
             unseen = self._unseen_manoeuvres(tick)
             if len(unseen):
                 inputs = np.concatenate((inputs, unseen))
@@ -175,7 +195,9 @@ class FleetTracker:
         if not _sound(estimate):
             raise ArithmeticError("the estimate is not finite or its covariance not positive")
         self._counters["estimate moved"] += estimate.report.moves
+        self._faults = 0
         self._good = _Good(estimate, self.roll.members, self.roll.own_located)
+        self._sieve.note(estimate, self.roll.members)
         self.present, self.innovations = self.roll.members, estimate.innovations
         self.range_biases = estimate.range_biases
         self.roll.note_estimate(estimate)
@@ -191,8 +213,14 @@ class FleetTracker:
         return Estimate(tick, np.zeros(STATES_PER_AGENT), covariance, Status.NO_DATA, age, SolverReport())
 
     def fall_back(self, tick: int) -> Estimate:
-        """After a fault: what follows from the last good estimate, flagged; the next tick starts from there."""
+        """After a fault: what follows from the last good estimate, flagged; the next tick starts from there.
+
+        After `FAULTS_IN_A_ROW` it is no use any more: then from nothing but what sensors say.
+        """
         self._estimator = None
+        self._faults += 1
+        if self._good is not None and self._faults >= FAULTS_IN_A_ROW:
+            self._begin_anew(tick, f"after {self._faults} faults in a row")
         if self._good is None:
             self.forget()
             return self.nothing(tick)
@@ -204,8 +232,20 @@ class FleetTracker:
 
     def forget(self) -> None:
         """Begin from nothing."""
-        self._estimator, self._good, self._since_s = None, None, None
+        self._estimator, self._good, self._since_s, self._faults = None, None, None, 0
+        self._sieve.forget()
         self.roll = Membership(self._config, self._agent_id)
+
+    def _begin_anew(self, tick: int, why: str) -> None:
+        """Give the estimate up, and say so."""
+        self._counters["begun anew"] += 1
+        self._anew = tick, why
+        self.forget()
+
+    def _lost(self, tick: int) -> tuple[int, ...]:
+        """Members whose every fix is out of reach of the estimate, and whom no ranges hold where it has them."""
+        held = GeometryMonitor()
+        return tuple(a for a in self._sieve.shut_out() if held.observe(self.roll.geometry(a, tick)))
 
     # --- start and change ----------------------------------------------------------------------------------
 
@@ -237,7 +277,7 @@ class FleetTracker:
         initial = self._config.initial
         if self._since_s is None:
             self._since_s = now_s
-        if initial.position_m is not None:
+        if initial.position_m is not None and self._anew is None:  # anew from what sensors say alone
             sigma = [POSITION_SIGMA_M] * 3 + [VELOCITY_SIGMA_MPS] * 3
             mean = np.array([*initial.position_m, 0.0, 0.0, 0.0])
             chosen = filter(self.roll.may_be_member, self._config.ids)
@@ -253,13 +293,13 @@ class FleetTracker:
         variance = [(2.0 * POSITION_SIGMA_M) ** 2] * 3 + [VELOCITY_SIGMA_MPS**2] * 3
         return mean, np.diag(variance)
 
-    def _change(self, tick: int) -> None:
-        """Take in who has been located since the last tick, let go who is gone."""
+    def _change(self, tick: int, lost: tuple[int, ...]) -> None:
+        """Take in who has been located since the last tick, let go who is gone or ``lost``."""
         assert self._estimator is not None
         if self._estimator.fixed_members:
             return
         fresh = self.roll.newcomers(tick, self._estimator.prior_tick)
-        gone = self.roll.gone(tick)
+        gone = tuple(dict.fromkeys((*self.roll.gone(tick), *(a for a in lost if a in self.roll.members))))
         if not fresh and not gone:
             return
         self._counters["drones joined"] += len(fresh)
@@ -302,6 +342,10 @@ def in_layout(estimate: Estimate, members: tuple[int, ...], layout: Layout) -> E
     covariance[np.ix_(at, at)] = estimate.covariance
     ages[[layout.slot(agent) for agent in members]] = told
     return replace(estimate, mean=mean, covariance=covariance, age_ticks=ages)
+
+
+def _measured_by(agent_id: int | None, own_id: int) -> str:
+    return "own measurements" if agent_id == own_id else f"measurements of {agent_id}"
 
 
 def _sound(estimate: Estimate) -> bool:

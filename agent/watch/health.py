@@ -66,6 +66,8 @@ _TEXTS = {
     What.SOMEBODY_OFF: "fixes of somebody off, not told whose",
     What.DIVERGED: "estimate of {0.about} outside its guaranteed set",
     What.BOUNDS_BROKEN: "stated bounds broken: {0.detail}",
+    What.IMPOSSIBLE: "{0.detail} impossible, off by {0.value:.0f}, not used",
+    What.BEGUN_ANEW: "estimate given up and begun anew, {0.detail}",
     What.AUTOPILOT: "autopilot {0.detail}",
     What.IMU_GAP: "IMU incomplete",
     What.UNAIDED: "attitude without aiding",

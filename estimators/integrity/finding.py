@@ -63,6 +63,10 @@ class What(Enum):
     """The estimate of a neighbour's relative position is outside the set that certainly holds it."""
     BOUNDS_BROKEN = auto()
     """Bounds that sensors are said to keep contradict each other: what is certain of a neighbour is not."""
+    IMPOSSIBLE = auto()
+    """A drone measured what cannot be: it is out of all reach of the estimate."""
+    BEGUN_ANEW = auto()
+    """The estimate was given up, after faults or against its own fixes, and begun from nothing."""
     AUTOPILOT = auto()
     """The link to the autopilot is not there."""
     IMU_GAP = auto()

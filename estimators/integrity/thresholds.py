@@ -101,6 +101,25 @@ SETTLED_S = 10.0
 """So long after its fixes have lost their weight a position is taken to have got over them: in a flight whose
 receiver is dragged away by 0.5 m/s its error is within its covariance after eight."""
 
+# --- what cannot be -------------------------------------------------------------------------------------------
+
+FAR_M = 1000.0
+"""A fix or range this far from the estimate is none: those of reflections are a tenth of it."""
+FAR_MPS = 100.0
+"""The same of a velocity or speed."""
+FAR_SIGMAS = 6.0
+"""On top of both, so many sigmas of the estimate: one that knows little refuses little."""
+IMPOSSIBLE_MPS2 = 500.0
+"""No accelerometer of a drone says more: the widest measure 16 to 30 g."""
+REFUSED_TOLD_S = 1.0
+"""So long after the last one it is told."""
+REFUSED_FOR_S = 3.0
+"""Fixes refused one and all for so long: where nothing else holds the drone, the estimate is what is wrong."""
+FAULTS_IN_A_ROW = 3
+"""Estimates of ticks on end that fail, after which it is no use to go on from the last good one."""
+BEGUN_ANEW_TOLD_S = 10.0
+"""So long after a start from nothing it is told."""
+
 # --- latency ------------------------------------------------------------------------------------------------
 
 LATENCY_SHARE = 1.0

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
 from agent.outputs import EstimateReady, Faulted
 from estimators.estimator import Status
-from tests.support.notebook_estimator import MakeConfig, lone, tick_through
+from tests.support.notebook_estimator import MakeConfig, fix, lone, tick_through
 from tests.support.onboard import CONNECTED
 
 Patch = pytest.MonkeyPatch
@@ -97,3 +100,68 @@ def test_a_fault_while_a_tick_is_closed_costs_that_tick_alone(make_config: MakeC
     fell = [r.estimate.tick for r in ready if r.estimate.status is Status.FELL_BACK]
     assert fell == [1004]
     assert core.counters["core faults"] == 1
+
+
+def test_three_faults_in_a_row_give_the_last_good_estimate_up(make_config: MakeConfig) -> None:
+    # GIVEN a core that has an estimate, and fixes to come
+    core, made = lone(make_config, "initial.fixes=5")
+    core.advance(100.0, CONNECTED)
+    tick_through(core, 100.0, 0.25)
+
+    def fail(what: str, tick: int) -> None:
+        if what == "solve" and tick >= 1003:
+            raise np.linalg.LinAlgError("singular")
+
+    def flown(start_s: float, duration_s: float) -> list[EstimateReady]:
+        ready = []
+        for step in range(round(duration_s / 0.01)):
+            now_s = start_s + 0.01 * step
+            if step % 20 == 0:
+                core.on_gps(fix(now_s), now_s)
+            ready += [o for o in core.advance(now_s, CONNECTED) if isinstance(o, EstimateReady)]
+        return ready
+
+    # WHEN every estimate made of the last good one fails
+    made[0].fail = fail
+    old = len(made)
+    factory = core.fleet._make_estimator
+
+    def remake(*arguments: Any) -> Any:
+        estimator = factory(*arguments)
+        if len(made) < old + 3:
+            made[-1].fail = fail
+        return estimator
+
+    core.fleet._make_estimator = remake
+    ready = flown(100.25, 3.0)
+    # THEN the third fault is the last: it begins anew from its own fixes, not from what it was told at the start
+    statuses = {r.estimate.tick: r.estimate.status for r in ready}
+    assert [statuses[tick] for tick in (1003, 1004, 1005)] == [Status.FELL_BACK, Status.FELL_BACK, Status.NO_DATA]
+    assert core.counters["begun anew"] == 1
+    back = min(tick for tick, status in statuses.items() if tick > 1005 and status is Status.OK)
+    assert back - 1003 <= 30
+    assert made[-1].mean[:3] == pytest.approx([1.0, 2.0, 3.0])
+    assert core.counters["estimator faults"] == 3
+    # AND says so, as an alarm, for a while
+    assert str(core.health.health).startswith("ALARM, aligning: estimate given up and begun anew, after 3 faults")
+    flown(103.25, 8.0)
+    assert "anew" not in str(core.health.health)
+
+
+def test_an_estimate_that_stands_against_all_own_fixes_is_given_up_where_nothing_else_holds_it(
+    make_config: MakeConfig,
+) -> None:
+    core, made = lone(make_config, "initial.fixes=5")
+    tick_through(core, 100.0, 0.25)
+    for step in range(700):
+        now_s = 100.25 + 0.01 * step
+        if step % 20 == 0:
+            there = replace(fix(now_s), position_m=(5000.0, 2.0, 3.0))
+            core.on_gps(there, now_s)
+        core.advance(now_s, CONNECTED)
+        if step == 100:
+            assert "own measurements impossible, off by 5000" in str(core.health.health)
+    assert core.counters["begun anew"] == 1
+    assert core.counters["impossible rows of 1"] >= 10
+    assert made[-1].mean[:3] == pytest.approx([5000.0, 2.0, 3.0])
+    assert "begun anew, against its own fixes" in str(core.health.health)

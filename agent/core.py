@@ -251,6 +251,10 @@ class AgentCore:
             self._fix_interval_s = found if known is None else known + FIX_SHARE * (found - known)
         self._last_fix_s = now_s
 
+    def gps_is_lost(self, now_s: float) -> bool:
+        """Whether the drone has to do without GPS."""
+        return gps_lost(self.gps_age_s(now_s), self._fix_interval_s)
+
     def gps_age_s(self, now_s: float) -> float | None:
         """Time since the last own fix came in; ``None`` before the first."""
         return None if self._last_fix_s is None else now_s - self._last_fix_s

@@ -20,11 +20,22 @@ from agent.config.agreement import shared_settings
 from agent.config.endpoints import LinkKind, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.core import AgentCore, EstimatorFactory
+from agent.feedback.feeder import FedAutopilot, Feeder, Ready
 from agent.inputs import Due, Gone, HouseKept, Input, Journal, MavlinkIn, PacketIn, Served, UwbIn
 from agent.mavlink.codec import mavlink
 from agent.mavlink.session import AutopilotSession, LinkState
 from agent.mavlink.signing import LinkSigning
-from agent.outputs import ClockStepped, CoreOutput, LinkChanged, NotSent, Output, Send, Tell, ToAutopilot
+from agent.outputs import (
+    ClockStepped,
+    CoreOutput,
+    EstimateReady,
+    LinkChanged,
+    NotSent,
+    Output,
+    Send,
+    Tell,
+    ToAutopilot,
+)
 from agent.sensing.clock import FleetClock, clock_fault
 from agent.sensing.frames import gravity_mps2
 from agent.sensing.samples import Sample
@@ -33,6 +44,7 @@ from agent.uwb.adapter import UwbAdapter
 from agent.watch.agreement_watch import AgreementWatch
 from agent.watch.health import State
 from agent.watch.position_watch import clock_finding
+from estimators.model.layout import block
 from transport.errors import EncodeError, Rejected
 from transport.messages.agreement_body import Agreement, agreement_hash
 from transport.messages.clock_body import ClockAnswer, decode_clock_question
@@ -115,6 +127,12 @@ class OnboardAgent:
             agreement=agreement_hash(shared),
         )
         self.unsent: Counter[str] = Counter()
+        self.feeder = Feeder(config, agent_id) if linked and config.feeds(agent_id) else None
+        """What gives the autopilot the estimate, where that is asked for."""
+        if self.feeder is not None:
+            self.autopilot.follower = self.feeder.on_message
+        self._cores = 1
+        """How many cores there have been."""
         self._told_state = LinkState.SEARCHING
         self._serve_s = -math.inf if linked else math.inf
         """When the autopilot's link is to be served next, host time."""
@@ -156,6 +174,8 @@ class OnboardAgent:
         now_s = self.fleet_s(host_s)
         for sample in samples:
             self.core.on_sample(sample, now_s)
+            if self.feeder is not None:
+                self.feeder.on_sample(sample)
         return session.heard > before
 
     def on_sample(self, sample: Sample, host_s: float) -> None:
@@ -217,6 +237,7 @@ class OnboardAgent:
         stepped = self.clock.sync(unix_s=unix_s, host_s=host_s)
         if stepped:
             self.core = self._new_core()
+            self._cores += 1
         self._look_around(host_s)
         outputs: list[Output] = [ClockStepped()] if stepped else []
         if self.agreement.is_contradicted(host_s):
@@ -265,11 +286,9 @@ class OnboardAgent:
         """What is due on the autopilot's link."""
         self._note(Served(host_s), host_s)
         frames = self.autopilot.to_send(host_s, SYSTEM_STATUS[self.core.health.health.state])
-        outputs: list[Output] = []
-        if frames:
-            outputs.append(ToAutopilot(tuple(frames)))
-            if self._journal is not None:
-                self._journal.note_sent(frames, self.unix_s(host_s))
+        if self.feeder is not None:
+            frames += [self.autopilot.encode(each) for each in self.feeder.to_send(self._link(), host_s)]
+        outputs = self._for_autopilot(frames, host_s)
         if self.autopilot.state is not self._told_state:
             self._told_state = self.autopilot.state
             outputs.append(LinkChanged(self._told_state))
@@ -284,7 +303,50 @@ class OnboardAgent:
         return outputs
 
     def _put_out(self, output: CoreOutput, host_s: float) -> list[Output]:
-        return self._sealed(output.message, self._unix_ns(host_s)) if isinstance(output, Tell) else [output]
+        if isinstance(output, Tell):
+            return self._sealed(output.message, self._unix_ns(host_s))
+        if isinstance(output, EstimateReady) and self.feeder is not None:
+            return [output, *self._feed(output, self.feeder, host_s)]
+        return [output]
+
+    def _feed(self, ready: EstimateReady, feeder: Feeder, host_s: float) -> list[Output]:
+        """What the autopilot is given of an estimate."""
+        session, link = self.autopilot, self._link()
+        feeder.on_life(link, (session.reboots, session.handovers, self._cores))
+        at_host_s = ready.t_s - self.clock.offset_s
+        # PX4 puts stamps on its clock itself, by our answers to its TIMESYNC; ArduPilot takes them as they are
+        stamp_s = at_host_s if link.flavour == "px4" else session.clock.boot_s(at_host_s)
+        orientation = self.core.timeline.orientation_at(ready.t_s)
+        own = block(self._config.bodies.index(self.agent_id))
+        offered = Ready(
+            t_s=ready.t_s,
+            now_s=self.fleet_s(host_s),
+            unix_s=self.unix_s(at_host_s),
+            mean=ready.estimate.mean[own],
+            covariance=ready.estimate.covariance[own, own],
+            status=ready.estimate.status,
+            statement=ready.integrity,
+            quaternion=None if orientation is None else orientation.quaternion,
+            stamp_us=None if stamp_s is None or stamp_s < 0.0 else round(stamp_s * 1e6),
+            gps_lost=self.core.gps_is_lost(self.fleet_s(host_s)),
+        )
+        frames = [session.encode(message) for message in feeder.on_estimate(offered, link, host_s)]
+        self._look_around(host_s)
+        return self._for_autopilot(frames, host_s)
+
+    def _for_autopilot(self, frames: list[bytes], host_s: float) -> list[Output]:
+        if not frames:
+            return []
+        if self._journal is not None:
+            self._journal.note_sent(frames, self.unix_s(host_s))
+        return [ToAutopilot(tuple(frames))]
+
+    def _link(self) -> FedAutopilot:
+        autopilot = self.autopilot.autopilot
+        if autopilot is None:
+            return FedAutopilot(False, "", 0, 0)
+        connected = self.autopilot.state is LinkState.CONNECTED
+        return FedAutopilot(connected, autopilot.flavour, autopilot.system_id, autopilot.component_id)
 
     def _sealed(self, message: Message, t_ns: int) -> list[Output]:
         """A message in packets; one that does not fit into any is counted."""
@@ -304,7 +366,8 @@ class OnboardAgent:
     def _look_around(self, host_s: float) -> None:
         """Say in the health why we reach nobody, as the tick fits no packet, or why others do not reach us."""
         fault = clock_fault(self._config.fleet, self.unix_s(host_s))
-        self.core.health.hold((*clock_finding(fault), *self.agreement.observe(host_s)))
+        fed = () if self.feeder is None else self.feeder.findings()
+        self.core.health.hold((*clock_finding(fault), *self.agreement.observe(host_s), *fed))
 
     def _new_core(self) -> AgentCore:
         period_s = self._config.fleet.period_s

@@ -9,15 +9,19 @@ from agent.config.endpoints import SPELLINGS, LinkKind, parse_endpoint
 from agent.config.faults import Fault
 from agent.config.tables import AgentTable, FleetConfig
 from agent.errors import EndpointError
+from agent.feedback.feedback_table import FEEDBACK_FITS
 from estimators.settings import EstimatorSettings
 from transport.link.addresses import MAX_PORT, endpoint_fault, is_host
 from transport.messages.measurement_body import MAX_POSITION_M
 
 IMU_FRAME_BYTES, ATTITUDE_FRAME_BYTES, GPS_FRAME_BYTES = 75, 44, 63
+FEED_FRAME_BYTES = 245
 OTHER_BYTES_PER_S = 500
 """Heartbeats, TIMESYNC and the like, with room for what the autopilot sends by itself."""
 BAUD_SHARE, BITS_PER_BYTE = 0.7, 10
 CENTRALISED = "centralized_ekf"
+LONGEST_FEED_PERIOD_S = 0.15
+"""PX4 begins with gaps below 0.2 s between messages only; ticks are late at times."""
 
 
 def faults_between(config: FleetConfig) -> Iterator[Fault]:
@@ -31,6 +35,7 @@ def faults_between(config: FleetConfig) -> Iterator[Fault]:
     yield from _times(config)
     yield from _radio(config)
     yield from _services(config)
+    yield from _feedback(config)
 
 
 def unknown_ids(config: FleetConfig, key: str, ids: Iterable[int]) -> Iterator[Fault]:
@@ -105,19 +110,22 @@ def _agents(config: FleetConfig) -> Iterator[Fault]:
             yield Fault(key, f"another address than agent {seen[opened]}'s", repr(agent.mavlink))
         seen[opened] = agent.id
         if endpoint.kind is LinkKind.SERIAL:
-            yield from _baud(config, key, agent.mavlink, endpoint.port)
+            yield from _baud(config, key, agent, endpoint.port)
 
 
-def _baud(config: FleetConfig, key: str, address: str, baud: int) -> Iterator[Fault]:
+def _baud(config: FleetConfig, key: str, agent: AgentTable, baud: int) -> Iterator[Fault]:
     """A serial line that the requested streams would fill: frames would be lost without a word."""
-    settings = config.mavlink
+    settings, address = config.mavlink, agent.mavlink
     needed = (
         settings.imu_hz * IMU_FRAME_BYTES
         + settings.attitude_hz * ATTITUDE_FRAME_BYTES
         + settings.gps_hz * GPS_FRAME_BYTES
         + OTHER_BYTES_PER_S
     )
+    fed = FEED_FRAME_BYTES / config.fleet.period_s if config.feeds(agent.id) else 0.0  # the other way, by itself
     usable = BAUD_SHARE * baud / BITS_PER_BYTE
+    if fed > usable:
+        yield Fault(key, f"a baud rate of {fed * BITS_PER_BYTE / BAUD_SHARE:.0f} or more for the feed", repr(address))
     if needed > usable:
         expected = f"a baud rate of {needed * BITS_PER_BYTE / BAUD_SHARE:.0f} or more for the rates in [mavlink]"
         given = str(baud) in address
@@ -195,6 +203,22 @@ def _services(config: FleetConfig) -> Iterator[Fault]:
             parse_endpoint(adsb.address)
         except EndpointError as error:
             yield Fault("adsb.address", SPELLINGS, str(error))
+
+
+def _feedback(config: FleetConfig) -> Iterator[Fault]:
+    """What autopilots are given has to come often enough, and be something that they read."""
+    table = config.feedback
+    yield from unknown_ids(config, "feedback.agents", table.agents or ())
+    if table.kind == "off":
+        return
+    if config.fleet.period_s > LONGEST_FEED_PERIOD_S:
+        expected = f"at most {LONGEST_FEED_PERIOD_S:g} with [feedback], as PX4 takes no slower feed"
+        yield Fault("fleet.period_s", expected, f"{config.fleet.period_s:g}")
+    for index, agent in enumerate(config.agents):
+        fits = FEEDBACK_FITS[table.kind]
+        if config.feeds(agent.id) and agent.autopilot not in ("auto", *fits):
+            expected = f'{" or ".join(fits)}, which read feedback.kind = "{table.kind}", or another feedback.agents'
+            yield Fault(f"agents[{index}].autopilot", expected, f'"{agent.autopilot}"')
 
 
 def _times(config: FleetConfig) -> Iterator[Fault]:

@@ -14,6 +14,7 @@ from agent.config.integrity_table import IntegrityTable
 from agent.config.observer_tables import AdsbTable, LogTable, MetricsTable
 from agent.config.other_tables import OtherTables
 from agent.config.security_table import SecurityTable
+from agent.feedback.feedback_table import FeedbackTable
 from agent.radio.radio_faults import FaultsTable
 from agent.radio.radio_links import LOOPBACK, RadioLink, radio_endpoints
 from estimators.model.layout import BodyKind, Kinds, Layout
@@ -271,6 +272,7 @@ class FleetConfig(Table, frozen=True):
     record: RecordTable = msgspec.field(default_factory=RecordTable)
     health: HealthTable = msgspec.field(default_factory=HealthTable)
     integrity: IntegrityTable = msgspec.field(default_factory=IntegrityTable)
+    feedback: FeedbackTable = msgspec.field(default_factory=FeedbackTable)
     metrics: MetricsTable = msgspec.field(default_factory=MetricsTable)
     log: LogTable = msgspec.field(default_factory=LogTable)
     adsb: AdsbTable = msgspec.field(default_factory=AdsbTable)
@@ -309,6 +311,16 @@ class FleetConfig(Table, frozen=True):
             if table.id == agent_id:
                 return table
         raise KeyError(f"agent {agent_id} is not in the fleet {self.ids}")
+
+    def feeds(self, agent_id: int) -> bool:
+        """Whether an agent's autopilot is given the estimate."""
+        fed = self.feedback.agents
+        return self.feedback.kind != "off" and (fed is None or agent_id in fed)
+
+    def fed_receiver(self, agent_id: int) -> int | None:
+        """Which receiver of an agent's autopilot is what we give it; ``None`` if none is."""
+        given = self.feeds(agent_id) and self.feedback.kind == "gps_input"
+        return self.feedback.gps_id if given else None
 
     def system_id(self, agent_id: int) -> int:
         """MAVLink system id of an agent's autopilot."""

@@ -88,12 +88,15 @@ class SampleAdapter:
         epoch_unix_s: float,
         fleet_time_of_boot: StampS,
         receivers: Collection[int] | None = None,
+        own_receiver: int | None = None,
     ) -> None:
+        """``own_receiver`` is the number of the one whose fixes are what we gave the autopilot."""
         self._frame = frame
         self._sensors = sensors
         self._epoch_unix_s = epoch_unix_s
         self._fleet_time_of_boot = fleet_time_of_boot
         self._known_receivers = receivers
+        self._own_receiver = own_receiver
         self._heard_s: dict[str, dict[int, float]] = {}
         """When each message of a kind last came, by its place among them."""
         self.flavour = "other"
@@ -203,6 +206,8 @@ class SampleAdapter:
 
     def _gps(self, message: Message, arrival_s: float, receiver: _HeardReceiver) -> Sample | None:
         """The fix of a receiver, if it is the one to be listened to."""
+        if receiver.number == self._own_receiver:
+            return self._skip("gps: given by us")
         fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
         lost = not self._has_fix(message)  # ArduPilot says so with the time and place of the last one
         if not lost and message.time_usec and fix == receiver.last_fix:

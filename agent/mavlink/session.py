@@ -7,6 +7,7 @@ with the same monotonic clock, so that a step of UTC cannot reach the autopilot'
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -40,6 +41,8 @@ PATIENCE_S = 5.0
 """A component that sends no sensors for so long is given up for one that does."""
 LOCAL_POSITION_HZ = 2.0
 """For comparison only, never a measurement."""
+FED_POSITION_HZ, FED_STATUS_HZ = 10.0, 5.0
+"""The same where the autopilot is given the estimate: what it makes of that is watched."""
 ESTIMATOR_STATUS_HZ = 2.0
 """Whether the autopilot's attitude is aided: an attitude without positions is tilted within a second."""
 _ESTIMATOR_STATUS = {
@@ -93,9 +96,16 @@ class AutopilotSession:
         self._encoder = Encoder(self._expected_system, config.mavlink.component_id, signing)
         self.clock = BootClock()
         self.samples = SampleAdapter(
-            FleetFrame.of(config), config.sensors, config.fleet.epoch_unix_s, self._fleet_time_of_boot
+            FleetFrame.of(config),
+            config.sensors,
+            config.fleet.epoch_unix_s,
+            self._fleet_time_of_boot,
+            own_receiver=config.fed_receiver(agent_id),
         )
-        self.rates = StreamRates(_wanted(config))
+        self._fed = config.feeds(agent_id)
+        self.rates = StreamRates(_wanted(config, self._fed))
+        self.follower: Callable[[Message, float | None, float], None] | None = None
+        """Gets every message of the autopilot, its stamp of the boot clock in fleet time, and the host time."""
         self.state = LinkState.SEARCHING
         self.autopilot: AutopilotId | None = None
         self.heard = 0
@@ -162,6 +172,10 @@ class AutopilotSession:
                 frames.append(self._encoder.encode(self._interval_command(*request)))
         return frames
 
+    def encode(self, message: Message) -> bytes:
+        """A message of ours as a frame for the autopilot."""
+        return self._encoder.encode(message)
+
     def _tell_time(self, now_s: float) -> None:
         if self.signing is not None:
             self.signing.unix_s = self._fleet_clock.fleet_s(now_s) + self._epoch_unix_s
@@ -179,6 +193,8 @@ class AutopilotSession:
         if self.autopilot is None or source != (self.autopilot.system_id, self.autopilot.component_id):
             self._on_stranger(message)
             return None
+        if self.follower is not None:
+            self.follower(message, self._stamped_s(message, now_s), now_s)
         if message_id == mavlink.MAVLINK_MSG_ID_TIMESYNC:
             self._on_timesync(message, now_s)
             return None
@@ -217,7 +233,7 @@ class AutopilotSession:
             self._taken_s = now_s
             self.rates.restart(now_s)
             if flavour in _ESTIMATOR_STATUS:
-                self.rates.add(_ESTIMATOR_STATUS[flavour], ESTIMATOR_STATUS_HZ)
+                self.rates.add(_ESTIMATOR_STATUS[flavour], FED_STATUS_HZ if self._fed else ESTIMATOR_STATUS_HZ)
 
     def _is_better(self, found: AutopilotId, now_s: float) -> bool:
         """Whether another component is rather the autopilot than the one that was taken for it."""
@@ -305,6 +321,10 @@ class AutopilotSession:
         host_s = self.clock.host_s(boot_s)
         return None if host_s is None else self._fleet_clock.fleet_s(host_s)
 
+    def _stamped_s(self, message: Message, now_s: float) -> float | None:
+        boot_s = shown_boot_s(message)
+        return None if boot_s is None else self._fleet_time_of_boot(boot_s, self._fleet_clock.fleet_s(now_s))
+
     # --- outgoing ------------------------------------------------------------------------------------------
 
     def _interval_command(self, message_id: int, interval_us: float) -> Message:
@@ -326,13 +346,14 @@ def _heartbeat(system_status: int) -> Message:
     )
 
 
-def _wanted(config: FleetConfig) -> dict[int, float]:
-    """Streams and rates in Hz, in the order in which they are asked for."""
+def _wanted(config: FleetConfig, fed: bool) -> dict[int, float]:
+    """Streams and rates in Hz, in the order in which they are asked for; more of an autopilot that is ``fed``."""
     settings = config.mavlink
+    more = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: FED_POSITION_HZ} if fed else {}
     return {
         mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: settings.imu_hz,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: settings.attitude_hz,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: settings.gps_hz,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
-        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: LOCAL_POSITION_HZ,
-    }
+        mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: FED_POSITION_HZ if fed else LOCAL_POSITION_HZ,
+    } | more

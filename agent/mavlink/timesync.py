@@ -104,6 +104,16 @@ class BootClock:
             return boot_s + min(difference for _, difference in self._envelope)
         return None
 
+    def boot_s(self, host_s: float) -> float | None:
+        """Boot time of a host time; ``None`` before anything was heard."""
+        boot_s = host_s
+        for _ in range(2):  # the drift between the two clocks makes the second guess exact to a microsecond
+            at_s = self.host_s(boot_s)
+            if at_s is None:
+                return None
+            boot_s += host_s - at_s
+        return boot_s
+
     @property
     def synchronised(self) -> bool:
         """Whether TIMESYNC was answered (otherwise the fallback is in use)."""

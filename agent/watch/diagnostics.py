@@ -104,6 +104,7 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
         ("mavlink refused ", {} if decoder.signing is None else dict(decoder.signing.refused)),
         ("skipped ", dict(session.samples.skipped)),
         ("noted ", dict(session.samples.noted)),
+        ("", {} if onboard.feeder is None else dict(onboard.feeder.counters)),
         ("", _samples(onboard)),
         ("skipped ", dict(core.timeline.skipped)),
         ("skipped uwb ", dict(uwb.skipped)),

@@ -22,6 +22,14 @@ class What(Enum):
     """A drone was given something else of what the fleet has to share: its packets are refused."""
     OTHER_VERSION = auto()
     """A drone's packets are of another version: they cannot be read."""
+    NOT_FUSED = auto()
+    """The autopilot does not use the estimate that it is given, or would not."""
+    NOT_FED = auto()
+    """The autopilot has no GPS, and the estimate is withheld from it."""
+    NOT_READY = auto()
+    """The estimate could not be given to the autopilot if its GPS were lost."""
+    GPS_BACK_WRONG = auto()
+    """The autopilot's GPS is back, somewhere else."""
     NO_ESTIMATE = auto()
     NOT_ALIGNED = auto()
     """The estimate has never been sure enough since its start."""

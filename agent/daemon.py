@@ -49,7 +49,9 @@ from agent.watch.diagnostics import (
     neighbour_gauges,
 )
 from agent.watch.faults import ProgramFaults
+from agent.watch.log_lines import level_of
 from agent.watch.observers import DaemonState, Observer
+from estimators.integrity.finding import Finding, Gravity, What
 from transport.errors import KeyFileError, SessionError, SettingsError, UnwritableError
 
 LOG = logging.getLogger("fleetloc.agent")
@@ -84,16 +86,18 @@ def run(
     *,
     base: Path = Path(),
     observers: Sequence[Observer] = (),
+    unrecorded: str = "",
 ) -> ExitCode:
     """Run the daemon of one agent until it is told to stop.
 
     ``base`` is the folder of the configuration file, which the key folder is relative to; ``observers`` are told
-    of every estimate, and of the state once a second.
+    of every estimate, and of the state once a second. ``unrecorded`` says why there is to be no record, although the
+    configuration wants one; the health says so then.
     """
     try:
         if agent_id not in config.ids:
             raise ConfigError("--id", "", f"one of {', '.join(map(str, config.ids))}", str(agent_id))
-        daemon = Daemon(config, agent_id, make_estimator, base, observers)
+        daemon = Daemon(config, agent_id, make_estimator, base, observers, unrecorded=unrecorded)
         warm_up(config, agent_id, make_estimator)
         asyncio.run(daemon.run())
     except KeyboardInterrupt:  # before the loop takes over the signals: nothing is open yet
@@ -128,7 +132,9 @@ class Daemon:
         base: Path,
         observers: Sequence[Observer] = (),
         periods: Periods | None = None,
+        unrecorded: str = "",
     ) -> None:
+        """``unrecorded``: why there is to be no record, although the configuration wants one."""
         self._config = config
         self._agent_id = agent_id
         self._periods = periods or Periods()
@@ -139,9 +145,15 @@ class Daemon:
         unix_s, host_s = time.time(), time.monotonic()
         signing = mavlink_signing(config, agent_id, base, unix_s=unix_s)
         self._record: RunLogs | None = None
-        if config.record.directory is not None:
+        self._unrecorded = unrecorded
+        if config.record.directory is not None and not unrecorded:
             directory = Path(config.record.directory)
-            self._record = RunLogs(config, agent_id, directory, identity.trust, unix_s=unix_s, host_s=host_s)
+            try:
+                self._record = RunLogs(config, agent_id, directory, identity.trust, unix_s=unix_s, host_s=host_s)
+            except LogFileError as error:  # a full disk grounds no drone
+                self._unrecorded = str(error)
+        if self._unrecorded:
+            LOG.error("agent %d: %s; flying without a record", agent_id, self._unrecorded)
         self.onboard = OnboardAgent(
             config,
             agent_id,
@@ -331,7 +343,7 @@ class Daemon:
                 case EstimateReady():
                     self._on_estimate(output)
                 case HealthChanged():
-                    LOG.info("agent %d: %s", self._agent_id, output.health)
+                    LOG.log(level_of(output.health), "agent %d: %s", self._agent_id, output.health)
                 case LinkChanged():
                     self._on_link_changed(output.state)
                 case Faulted():
@@ -383,12 +395,18 @@ class Daemon:
             await asyncio.sleep(self._periods.housekeeping_s)
             self._look_at_link(time.monotonic())
             with self._faults.survived("keeping house"):
+                self.onboard.hold(self._found())
                 self._carry_out(self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()))
                 self._advance()
             with self._faults.survived("telling the state"):
                 self._tell_state()
             with self._faults.survived("asking for clocks"):
                 await self.radio.ask_clocks()
+
+    def _found(self) -> tuple[Finding, ...]:
+        """What is wrong with the daemon itself."""
+        trouble = self._unrecorded or ("" if self._record is None else self._record.trouble)
+        return (Finding(What.NOT_RECORDED, Gravity.DEGRADED, detail=trouble),) if trouble else ()
 
     def _tell_state(self) -> None:
         state = self.state()

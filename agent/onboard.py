@@ -44,6 +44,7 @@ from agent.uwb.adapter import UwbAdapter
 from agent.watch.agreement_watch import AgreementWatch
 from agent.watch.health import State
 from agent.watch.position_watch import clock_finding
+from estimators.integrity.finding import Finding
 from estimators.model.layout import block
 from transport.errors import EncodeError, Rejected
 from transport.messages.agreement_body import Agreement, agreement_hash
@@ -133,6 +134,7 @@ class OnboardAgent:
             self.autopilot.follower = self.feeder.on_message
         self._cores = 1
         """How many cores there have been."""
+        self._told_by_shell: tuple[Finding, ...] = ()
         self._told_state = LinkState.SEARCHING
         self._serve_s = -math.inf if linked else math.inf
         """When the autopilot's link is to be served next, host time."""
@@ -243,6 +245,10 @@ class OnboardAgent:
         if self.agreement.is_contradicted(host_s):
             outputs += self._sealed(self.agreement.own, self._unix_ns(host_s))
         return outputs
+
+    def hold(self, findings: tuple[Finding, ...]) -> None:
+        """What the shell has found, for the health; until it says otherwise."""
+        self._told_by_shell = findings
 
     def tell(self, message: Message, host_s: float) -> list[Output]:
         """Send a message of the shell's own, such as what the daemon says of itself."""
@@ -367,7 +373,8 @@ class OnboardAgent:
         """Say in the health why we reach nobody, as the tick fits no packet, or why others do not reach us."""
         fault = clock_fault(self._config.fleet, self.unix_s(host_s))
         fed = () if self.feeder is None else self.feeder.findings()
-        self.core.health.hold((*clock_finding(fault), *self.agreement.observe(host_s), *fed))
+        held = (*clock_finding(fault), *self.agreement.observe(host_s), *fed, *self._told_by_shell)
+        self.core.health.hold(held)
 
     def _new_core(self) -> AgentCore:
         period_s = self._config.fleet.period_s

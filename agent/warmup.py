@@ -1,4 +1,8 @@
-"""A few ticks of a make-believe fleet, so that compiled kernels are loaded before the first real tick."""
+"""A few ticks of a make-believe fleet, so that compiled kernels are loaded before the first real tick.
+
+Then whatever those ticks did not call is loaded as well: in flight nothing is read from the cache any more, which may
+be gone by then, or the descriptors to open it with.
+"""
 
 from __future__ import annotations
 
@@ -6,6 +10,7 @@ import numpy as np
 
 from agent.config.tables import FleetConfig
 from agent.core import ESTIMATOR_FAULTS, EstimatorFactory
+from estimators.compiled import entries as compiled
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
 from estimators.model.measurements import RowTable, Vector, input_rows, position_rows, range_row, speed_row
 
@@ -34,7 +39,8 @@ def warm_up(config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory
                 estimator.mix(round_, dict.fromkeys(others[:1], payload))
             estimator.solve()
     except ESTIMATOR_FAULTS:
-        return
+        pass
+    compiled.warm_up()
 
 
 def _rows(tick: int, layout: Layout, mean: Vector) -> RowTable:

@@ -15,6 +15,14 @@ def free_bytes(directory: Path) -> int:
     return shutil.disk_usage(directory).free
 
 
+def too_little_left(directory: Path, free: Callable[[Path], int] = free_bytes) -> str:
+    """Why a record may take no more of a folder's disk, empty if it may; raises `OSError`."""
+    left = free(directory)
+    if left < MIN_FREE_BYTES:
+        return f"the disk has {left / 1e6:.0f} MB left, and {MIN_FREE_BYTES / 1e6:g} MB stay free"
+    return ""
+
+
 class DiskLimit:
     """Says when a record has to end: it is as large as it may be, or the disk is nearly full.
 
@@ -33,9 +41,13 @@ class DiskLimit:
         self._min_free_bytes = min_free_bytes
         self._free = free
 
+    def is_reached_by(self, size_bytes: int) -> bool:
+        """Whether a record of this size is as large as it may be, whatever the disk has left."""
+        return size_bytes >= self._max_bytes
+
     def reached(self, size_bytes: int) -> str:
         """Why a record of this size may not grow, empty if it may; raises `OSError`."""
-        if size_bytes >= self._max_bytes:
+        if self.is_reached_by(size_bytes):
             return f"it has the {self._max_bytes / 1e6:g} MB of record.flight_max_mb"
         free = self._free(self._directory)
         if free < self._min_free_bytes:

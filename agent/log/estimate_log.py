@@ -96,6 +96,8 @@ class EstimateLogWriter:
         """Entries written."""
         self.skipped = 0
         """Entries not written: the file is full or the disk fails."""
+        self.trouble = ""
+        """Why the disk did not take the latest of them."""
         self._dtype = entry_dtype(len(header.agents), header.joint)
         self._layout, self._joint = Layout(header.agents), header.joint
         self._triangle = np.triu_indices(self._layout.dimension)
@@ -130,10 +132,16 @@ class EstimateLogWriter:
             self._file.write(entry.tobytes())
             self._left_bytes -= self._dtype.itemsize
             self.written += 1
-            if self.written % FLUSH_EVERY == 0:
+            if self.written <= FLUSH_EVERY or self.written % FLUSH_EVERY == 0 or self.trouble:
                 self._file.flush()
-        except OSError:  # a full disk must not ground the fleet
+                self.trouble = ""
+        except OSError as error:  # a full disk must not ground the fleet
             self.skipped += 1
+            self.trouble = error.strerror or str(error)
+
+    def end(self, reason: str) -> None:
+        """Take no more: what is left of the disk belongs to others; ``reason`` says why."""
+        self._left_bytes, self.trouble = 0, reason
 
     def _put_joint(self, entry: NDArray[np.void], covariance: Matrix, joint: Sequence[int]) -> None:
         slots = [self._layout.slot(agent) for agent in joint]

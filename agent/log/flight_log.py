@@ -64,12 +64,22 @@ class FlightLog:
         self._inputs = 0
         self._closing = False
         self.ended = ""
+        self.trouble = ""
+        """The same where that is not as wanted: the disk is full, fails or is too slow."""
         self.counters: Counter[str] = Counter()
         self._waiting: queue.SimpleQueue[list[_Entry] | None] = queue.SimpleQueue()
         self._thread: threading.Thread | None = None
         if threaded:
-            self._thread = threading.Thread(target=self._work, name="flight log", daemon=True)
-            self._thread.start()
+            try:
+                self._thread = self._start_thread()
+            except RuntimeError as error:  # the system has no more
+                self._files.close("no thread to write it")
+                raise LogFileError(f"record {stem}{SUFFIX}: no thread to write it: {error}") from error
+
+    def _start_thread(self) -> threading.Thread:
+        thread = threading.Thread(target=self._work, name="flight log", daemon=True)
+        thread.start()
+        return thread
 
     # --- on the daemon's loop -------------------------------------------------------------------------------
 
@@ -124,6 +134,7 @@ class FlightLog:
             self.counters["record dropped"] += len(batch)
             self._finish(self.ended)
             return
+        as_wanted = self._limit.is_reached_by(self._files.size_bytes)
         try:
             reason = self._limit.reached(self._files.size_bytes)
             if not reason:
@@ -133,14 +144,19 @@ class FlightLog:
         except OSError as error:
             reason = f"the disk fails: {error.strerror or error}"
         self.counters["record dropped"] += len(batch)
-        self._end(reason)
+        self._end(reason, as_wanted=as_wanted)
         self._finish(reason)
 
-    def _end(self, reason: str) -> None:
+    def _end(self, reason: str, *, as_wanted: bool = False) -> None:
         if not self.ended:
-            self.ended = reason
+            self.ended, self.trouble = reason, "" if as_wanted else reason
             self.counters["record ended early"] += 1
-            LOG.warning("%s ends here: %s; flying on without", self._who, reason)
+            LOG.log(
+                logging.WARNING if as_wanted else logging.ERROR,
+                "%s ends here: %s; flying on without",
+                self._who,
+                reason,
+            )
 
     def _finish(self, reason: str) -> None:
         if self._closing:

@@ -2,20 +2,22 @@
 
 from __future__ import annotations
 
-import asyncio
 import platform
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 from agent.config.reading import dump
 from agent.config.tables import FleetConfig
-from agent.log.disk import DiskLimit
+from agent.errors import LogFileError
+from agent.log.disk import DiskLimit, free_bytes, too_little_left
 from agent.log.estimate_log import SUFFIX, EstimateLogWriter, header_of, write_summary
 from agent.log.estimate_mcap import agent_key
 from agent.log.flight_format import FlightStart, trust_text
 from agent.log.flight_log import FlightLog
 from agent.outputs import EstimateReady
 from agent.watch.observers import DaemonState, Observer
+from transport.link.off_loop import off_loop
 from transport.security.auth import Trust
 
 MB = 1e6
@@ -29,18 +31,47 @@ class RunLogs(Observer):
     """The files ``agent_001.*`` of one run; ``flight`` is the journal of a flight log, if one is wanted."""
 
     def __init__(
-        self, config: FleetConfig, agent_id: int, directory: Path, trust: Trust, *, unix_s: float, host_s: float
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        directory: Path,
+        trust: Trust,
+        *,
+        unix_s: float,
+        host_s: float,
+        free: Callable[[Path], int] = free_bytes,
     ) -> None:
         """Make the files anew; raises `LogFileError`. The times are those that the agent's clock began with."""
         settings = config.record
+        self._directory, self._free = directory, free
+        self._require_room()
         self._epoch_unix_s = config.fleet.epoch_unix_s
         stem = directory / agent_key(agent_id)
         path = stem.with_suffix(SUFFIX)
         self._estimates = EstimateLogWriter(path, header_of(config, agent_id), int(ESTIMATES_MB * MB))
         self.flight: FlightLog | None = None
         if settings.flight:
-            limit = DiskLimit(directory, int(settings.flight_max_mb * MB))
-            self.flight = FlightLog(stem, config, flight_start(config, agent_id, trust, unix_s, host_s), limit)
+            limit = DiskLimit(directory, int(settings.flight_max_mb * MB), free=free)
+            start = flight_start(config, agent_id, trust, unix_s, host_s)
+            try:
+                self.flight = FlightLog(stem, config, start, limit)
+            except LogFileError:
+                self._estimates.close()
+                raise
+
+    def _require_room(self) -> None:
+        try:
+            self._directory.mkdir(parents=True, exist_ok=True)
+            full = too_little_left(self._directory, self._free)
+        except OSError as error:
+            raise LogFileError(f"record {self._directory}: cannot be written: {error.strerror}") from error
+        if full:
+            raise LogFileError(f"record {self._directory}: cannot be written: {full}")
+
+    @property
+    def trouble(self) -> str:
+        """Why what should be recorded is not, empty if it is; a flight log as large as it may be is none."""
+        return self._estimates.trouble or ("" if self.flight is None else self.flight.trouble)
 
     def counters(self) -> dict[str, int]:
         """What was not written, and how far the flight log is."""
@@ -53,6 +84,12 @@ class RunLogs(Observer):
             self.flight.on_estimate(ready, published_s, published_s + self._epoch_unix_s)
 
     def on_second(self, state: DaemonState) -> None:
+        try:
+            full = too_little_left(self._directory, self._free)
+        except OSError as error:
+            full = error.strerror or str(error)
+        if full:
+            self._estimates.end(full)
         if self.flight is not None:
             self.flight.hand_over()
 
@@ -60,7 +97,7 @@ class RunLogs(Observer):
         """Write everything out, and the counters beside it; raises `LogFileError` if those cannot be written."""
         self._estimates.close()
         if self.flight is not None:
-            await asyncio.to_thread(self.flight.close)
+            await off_loop(self.flight.close)
         write_summary(self._estimates.path.with_suffix(".json"), state.as_dict())
 
 

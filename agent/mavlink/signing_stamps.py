@@ -12,6 +12,7 @@ from agent.errors import LogFileError
 from agent.mavlink.signing import LinkSigning, Stamps
 from agent.watch.observers import DaemonState, Observer
 from transport.errors import KeyFileError
+from transport.link.off_loop import off_loop
 from transport.security.key_files import OTHERS, PRIVATE, check_mode, read_text, write_text
 
 LOG = logging.getLogger("fleetloc.agent")
@@ -65,6 +66,6 @@ class StampKeeper(Observer):
 
     async def _save(self) -> None:
         try:
-            await asyncio.to_thread(self._file.save, self._signing.stamps)
+            await off_loop(self._file.save, self._signing.stamps)
         except LogFileError as error:  # a full disk does not end a flight
             LOG.warning("mavlink signing: %s", error)

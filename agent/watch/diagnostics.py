@@ -67,9 +67,10 @@ def _cpu_s() -> float:
 
 
 def _rss_mb() -> float:
-    statm = Path("/proc/self/statm")
-    if statm.exists():
-        return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    try:
+        return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE") / 1e6
+    except OSError:  # another system, or no descriptor is left: then the largest that it was
+        pass
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 

@@ -76,6 +76,7 @@ _TEXTS = {
     What.IMU_GAP: "IMU incomplete",
     What.UNAIDED: "attitude without aiding",
     What.NO_FIX: "no GPS",
+    What.NOT_RECORDED: "not recorded: {0.detail}",
     What.SILENT: "not heard: {0}",
     What.LATENCY: "latency of GPS not known",
     What.FIX_REFUSED: "fix refused",

@@ -11,6 +11,7 @@ from pathlib import Path
 from agent.config.observer_tables import LogTable
 from agent.errors import LogFileError
 from agent.log.disk import MIN_FREE_BYTES, free_bytes
+from agent.watch.health import Health, State
 
 LEVELS = (logging.WARNING, logging.INFO, logging.DEBUG)
 LINE = "%(asctime)s %(levelname)s %(message)s"
@@ -44,6 +45,15 @@ def log_file(table: LogTable, agent_id: int, free: Callable[[Path], int] = free_
         return LimitedLogFile(path, *limits, free)
     except OSError as error:
         raise LogFileError(f"log {path}: cannot be written: {error.strerror or error}") from error
+
+
+def level_of(health: Health) -> int:
+    """How loud a health is told: what may not be used, or may be wrong unnoticed, is an error."""
+    if health.state in (State.INIT, State.ALIGNING):  # nothing is to be used yet
+        return logging.WARNING if health.alarm else logging.INFO
+    if health.alarm or health.state is State.FAULT:
+        return logging.ERROR
+    return logging.WARNING if health.state is State.DEGRADED else logging.INFO
 
 
 class LimitedLogFile(RotatingFileHandler):

@@ -9,10 +9,8 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Iterator, Mapping
-from threading import Thread
-from wsgiref.simple_server import WSGIServer
 
-from prometheus_client import CollectorRegistry, Histogram, start_http_server
+from prometheus_client import CollectorRegistry, Histogram, make_wsgi_app
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
@@ -20,6 +18,7 @@ from agent.config.tables import FleetConfig
 from agent.errors import OPENING_FAULTS, LinkError, cause_of
 from agent.outputs import EstimateReady
 from agent.watch.health import State
+from agent.watch.metrics_server import BoundedServer
 from agent.watch.observers import DaemonState, Observer
 
 PREFIX = "fleetloc"
@@ -146,8 +145,7 @@ class Metrics(Observer, Collector):
         self._own = slice(6 * slot, 6 * slot + 3)
         self._state: DaemonState | None = None
         self._sigma_m: list[float] = []
-        self._server: WSGIServer | None = None
-        self._thread: Thread | None = None
+        self._server: BoundedServer | None = None
         self.registry = CollectorRegistry()
         labels = {"fleet": self._fleet, "agent": str(agent_id)}
         self._labels = labels
@@ -163,7 +161,8 @@ class Metrics(Observer, Collector):
     async def open(self) -> None:
         """Listen; raises `LinkError` naming the address."""
         try:
-            self._server, self._thread = start_http_server(self._port, self._host, self.registry)
+            self._server = BoundedServer(self._host, self._port, make_wsgi_app(self.registry))
+            self._server.start()
         except OPENING_FAULTS as error:
             where = f"metrics {self._host}:{self._port}"
             raise LinkError(f"{where}: cannot be listened on: {cause_of(error)}") from error
@@ -177,10 +176,8 @@ class Metrics(Observer, Collector):
         self._state = state
 
     async def close(self, state: DaemonState) -> None:
-        if self._server is not None and self._thread is not None:
-            await asyncio.to_thread(self._server.shutdown)
-            self._server.server_close()
-            await asyncio.to_thread(self._thread.join)
+        if self._server is not None:
+            await asyncio.to_thread(self._server.stop)
             self._server = None
 
     def collect(self) -> Iterator[Metric]:

@@ -24,6 +24,8 @@ class ServiceManager(Observer):
     def __init__(self, address: str, *, watchdog: bool) -> None:
         self._address = f"\0{address[1:]}" if address.startswith("@") else address
         self._watchdog = watchdog
+        self._socket: socket.socket | None = None
+        """Kept: the watchdog is fed also when no descriptor is left."""
         self._status = ""
         self.failed = 0
         """Messages that could not be sent."""
@@ -56,11 +58,15 @@ class ServiceManager(Observer):
 
     async def close(self, state: DaemonState) -> None:
         self._tell("STOPPING=1")
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
 
     def _tell(self, *lines: str) -> None:
         try:
-            with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as to_manager:
-                to_manager.sendto("\n".join(lines).encode(), self._address)
+            if self._socket is None:
+                self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+            self._socket.sendto("\n".join(lines).encode(), self._address)
         except OSError as error:
             self.failed += 1
             if self.failed == 1:

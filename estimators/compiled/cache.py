@@ -9,7 +9,8 @@ from a read-only image, so this cache
 - hands out one lock per folder, so that one process compiles while the others wait and then load.
 
 Environment: ``FLEETLOC_CACHE`` names the folder (default: ``fleetloc`` in the user's cache folder).
-The files are pickles: the folder must be writable by trusted users only.
+The files are pickles, so whoever writes one runs code here: only those are looked at that belong to the user who
+runs this, or to root, and that nobody else may write.
 """
 
 from __future__ import annotations
@@ -35,6 +36,7 @@ FORMAT = 1
 """Version of the files' layout."""
 KEPT_PER_KERNEL = 4
 """Files of one kernel for the same target that are kept: a few sources side by side, not all ever seen."""
+OTHERS_WRITE = 0o022
 _DIGEST_BYTES = 32
 _SUFFIX = ".kernel"
 
@@ -158,11 +160,16 @@ class KernelCache(caching._Cache):
         """The stored payload, or None if there is none or it is damaged (which is reported)."""
         path = self.path(signature, target_context)
         try:
-            stored = path.read_bytes()
+            with path.open("rb") as file:
+                distrusted = _distrusted(os.fstat(file.fileno()))
+                stored = b"" if distrusted else file.read()
         except FileNotFoundError:
             return None
         except OSError as error:
             self._report(f"cannot read {path}: {error.strerror}")
+            return None
+        if distrusted:
+            self._report(f"{path} {distrusted}: not used, and compiled again")
             return None
         digest, payload = stored[:_DIGEST_BYTES], stored[_DIGEST_BYTES:]
         if hashlib.sha256(payload).digest() != digest:
@@ -195,7 +202,9 @@ class KernelCache(caching._Cache):
         temporary = path.with_suffix(f".{os.getpid()}.tmp")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            temporary.write_bytes(hashlib.sha256(payload).digest() + payload)
+            temporary.unlink(missing_ok=True)
+            with open(temporary, "xb", opener=_private) as file:
+                file.write(hashlib.sha256(payload).digest() + payload)
             temporary.replace(path)
             _remove_old(path)
         except OSError as error:
@@ -210,6 +219,20 @@ class KernelCache(caching._Cache):
 
     def flush(self) -> None:
         """Part of numba's interface; a file is replaced, never emptied."""
+
+
+def _distrusted(status: os.stat_result) -> str:
+    """Why a file is not to be believed; empty if it is."""
+    if status.st_uid not in (os.geteuid(), 0):
+        return f"belongs to user {status.st_uid}, expected {os.geteuid()} or root"
+    if status.st_mode & OTHERS_WRITE:
+        return f"can be written by others (mode {status.st_mode & 0o777:03o})"
+    return ""
+
+
+def _private(path: str, flags: int) -> int:
+    """Make a file that others may read whatever the mask is, and only we may write."""
+    return os.open(path, flags, 0o644 & ~OTHERS_WRITE)
 
 
 def _remove_old(newest: Path) -> None:

@@ -83,6 +83,8 @@ class What(Enum):
     """The autopilot's attitude is that of an estimator without positions: it tilts."""
     NO_FIX = auto()
     """No position fix of late."""
+    NOT_RECORDED = auto()
+    """The flight is not taken down as it should be: the disk refuses."""
     SILENT = auto()
     """A drone that should be heard is not."""
     LATENCY = auto()

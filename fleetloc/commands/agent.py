@@ -63,20 +63,29 @@ def agent(
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.BAD_INPUT) from error
     try:
-        configure_logging(0 if quiet else 1 + verbose, log_file(fleet.log, agent_id))
+        file = log_file(fleet.log, agent_id)
+        unlogged = ""
+    except LogFileError as error:  # a full disk grounds no drone
+        file, unlogged = None, str(error)
+    configure_logging(0 if quiet else 1 + verbose, file)
+    log = logging.getLogger("fleetloc.agent")
+    if unlogged:
+        log.error("agent %d: %s; flying without a log file", agent_id, unlogged)
+    try:
         observers = observers_of(fleet, agent_id, config.parent) if agent_id in fleet.ids else []
-    except LogFileError as error:
-        raise NotStarted(str(error), ExitCode.RECORD) from error
     except ConfigError as error:
         raise NotStarted(str(error), ExitCode.BAD_INPUT) from error
     except KeyFileError as error:
         raise NotStarted(str(error), ExitCode.KEYS) from error
     if unset is not None:
-        logging.getLogger("fleetloc.agent").warning("agent %d: %s; nothing is sent until it is set", agent_id, unset)
+        log.warning("agent %d: %s; nothing is sent until it is set", agent_id, unset)
     announce()
+    unrecorded = ""
     if fleet.record.directory is not None:
         try:
             keep_earlier_record(Path(fleet.record.directory), agent_id)
         except OSError as error:
-            raise NotStarted(f"record {fleet.record.directory}: {error.strerror}", ExitCode.RECORD) from error
-    raise typer.Exit(run(fleet, agent_id, make_estimator, base=config.parent, observers=observers))
+            unrecorded = f"record {fleet.record.directory}: an earlier one cannot be put aside: {error.strerror}"
+    raise typer.Exit(
+        run(fleet, agent_id, make_estimator, base=config.parent, observers=observers, unrecorded=unrecorded)
+    )

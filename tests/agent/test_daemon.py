@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import signal
 import socket
@@ -19,6 +20,7 @@ from agent.config.reading import dump
 from agent.daemon import Daemon, Periods
 from agent.exit_codes import ExitCode
 from agent.log.estimate_log import read_entries
+from agent.log.flight_log import FlightLog
 from agent.mavlink.codec import Encoder, mavlink
 from agent.outputs import ClockStepped
 from agent.watch.observers import DaemonState, Observer
@@ -271,6 +273,55 @@ class Watching(Observer):
         self.ended = True
         if self.fails:
             raise RuntimeError("no end either")
+
+
+@pytest.mark.parametrize("cause", ["folder", "disk", "threads", "given"])
+async def test_without_a_record_a_daemon_flies_and_says_so(
+    config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cause: str
+) -> None:
+    # GIVEN a folder, a disk or a system that takes no record, or one that could not be put aside
+    (tmp_path / "file").write_text("")
+    folder = tmp_path / ("file" if cause == "folder" else "rec")
+    if cause == "disk":
+        monkeypatch.setattr("agent.log.run_logs.too_little_left", lambda *_: "the disk has 12 MB left")
+    if cause == "threads":
+        monkeypatch.setattr(FlightLog, "_start_thread", _no_threads)
+    config = config_of(1, "security.mode=unsigned", f'record.directory="{folder}"')
+    words = {"given": "earlier record in the way", "threads": "no thread", "disk": "12 MB", "folder": "cannot be"}
+    with caplog.at_level(logging.ERROR, "fleetloc.agent"):
+        given = words["given"] if cause == "given" else ""
+        daemon = Daemon(config, 1, make_estimator, Path(), unrecorded=given)
+    running = asyncio.create_task(daemon.run())
+    # THEN ticks come, and health and log say why there is no record
+    await until(lambda: daemon.core.counters["ticks"] > 5, "ticks")
+    await until(lambda: "not recorded: " in str(daemon.core.health.health), "the reason")
+    assert words[cause] in str(daemon.core.health.health)
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    (line,) = [record.getMessage() for record in caplog.records if "flying without a record" in record.getMessage()]
+    assert words[cause] in line
+    assert not list(tmp_path.glob("rec/*.json"))
+
+
+async def test_a_disk_that_fills_up_in_flight_is_told_and_flown_on_with(config_of: Any, tmp_path: Path) -> None:
+    free = [1e9]
+    config = config_of(1, "security.mode=unsigned", f'record.directory="{tmp_path / "rec"}"')
+    daemon = Daemon(config, 1, make_estimator, Path())
+    daemon._record._free = lambda _: free[0]  # type: ignore[union-attr,assignment,return-value]
+    running = asyncio.create_task(daemon.run())
+    await until(lambda: daemon.core.counters["ticks"] > 5, "ticks")
+    free[0] = 1e7
+    await until(lambda: "not recorded: the disk has 10 MB left" in str(daemon.core.health.health), "the reason")
+    ticks = daemon.core.counters["ticks"]
+    await until(lambda: daemon.core.counters["ticks"] > ticks + 5, "more ticks")
+    daemon.stop()
+    await asyncio.wait_for(running, PATIENCE_S)
+    _, entries = read_entries(tmp_path / "rec" / "agent_001.estimates")
+    assert 5 < len(entries) < daemon.core.counters["ticks"]
+
+
+def _no_threads(_log: FlightLog) -> None:
+    raise RuntimeError("can't start new thread")
 
 
 async def test_observers_are_told_and_cannot_hurt(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:

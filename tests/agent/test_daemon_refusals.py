@@ -55,13 +55,6 @@ def test_missing_keys(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path
     assert "fleetloc keys" in line
 
 
-def test_a_record_that_cannot_be_written(config_of: Any, caplog: pytest.LogCaptureFixture, tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    code, line = expect_exit(config_of(1, f"record.directory={tmp_path / 'file'}"), 1, caplog)
-    assert code is ExitCode.RECORD
-    assert "cannot be written" in line
-
-
 def test_an_autopilot_that_never_appears(config_of: Any, caplog: pytest.LogCaptureFixture) -> None:
     code, line = expect_exit(config_of(1, "mavlink.appear_timeout_s=0.2", "fleet.period_s=1.0"), 1, caplog)
     assert code is ExitCode.NO_AUTOPILOT

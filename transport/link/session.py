@@ -18,6 +18,7 @@ from typing import Any
 import zenoh
 
 from transport.errors import SessionError
+from transport.link.off_loop import off_loop
 from transport.link.session_settings import SessionSettings, zenoh_config
 from transport.link.streams import (
     Stream,
@@ -214,7 +215,7 @@ class Session:
         if self._closed:
             return
         self._closed = True
-        await asyncio.to_thread(self._close)
+        await off_loop(self._close)
         with self._lock:
             self._inbox.clear()
 

@@ -16,7 +16,7 @@ from agent.errors import ConfigError, LogFileError
 from agent.exit_codes import ExitCode
 from agent.mavlink.adsb import AdsbReporter
 from agent.watch.health import Health, State
-from agent.watch.log_lines import LimitedLogFile, configure_logging, log_file
+from agent.watch.log_lines import LimitedLogFile, configure_logging, level_of, log_file
 from agent.watch.metrics import Metrics
 from agent.watch.observer_list import observers_of
 from agent.watch.observers import DaemonState
@@ -74,13 +74,44 @@ async def test_a_watched_service_says_ready_alive_and_stopping(tmp_path: Path, m
 WATCHES: list[dict[str, str]] = [{}, {"WATCHDOG_USEC": "9000000", "WATCHDOG_PID": "41"}, {"WATCHDOG_USEC": "x"}]
 
 
+async def test_the_watchdog_is_fed_when_no_descriptor_is_left(
+    tmp_path: Path, manager: Manager, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    environment = {"NOTIFY_SOCKET": str(tmp_path / "notify"), "WATCHDOG_USEC": "10000000"}
+    told = ServiceManager.of(environment)
+    assert told is not None
+    await told.open()
+    with monkeypatch.context() as patch:
+        patch.setattr(socket, "socket", lambda *_: (_ for _ in ()).throw(OSError(24, "Too many open files")))
+        told.on_second(state_of(State.OK))
+        await told.close(state_of(State.OK))
+    assert manager.heard() == ["READY=1", "WATCHDOG=1\nSTATUS=agent 7: ok", "STOPPING=1"]
+    assert told.failed == 0
+
+
+@pytest.mark.parametrize(
+    ("health", "level"),
+    [
+        (Health(State.OK, ()), logging.INFO),
+        (Health(State.ALIGNING, ()), logging.INFO),
+        (Health(State.ALIGNING, ("not observable",), alarm=True), logging.WARNING),
+        (Health(State.DEGRADED, ("no GPS",)), logging.WARNING),
+        (Health(State.FAULT, ("position unknown",)), logging.ERROR),
+        (Health(State.DEGRADED, ("not observable",), alarm=True), logging.ERROR),
+    ],
+)
+def test_what_may_not_be_used_is_told_as_an_error(health: Health, level: int) -> None:
+    assert level_of(health) == level
+
+
 @pytest.mark.parametrize("watch", WATCHES)
 async def test_a_foreign_watchdog_is_not_fed(tmp_path: Path, manager: Manager, watch: dict[str, str]) -> None:
     service = ServiceManager.of({"NOTIFY_SOCKET": str(tmp_path / "notify"), **watch}, process_id=42)
     assert service is not None
     service.on_second(state_of(State.OK))
     service.on_second(state_of(State.OK))
-    assert manager.heard() == ["STATUS=agent 7: ok"]
+    await service.close(state_of(State.OK))
+    assert manager.heard() == ["STATUS=agent 7: ok", "STOPPING=1"]
 
 
 def test_a_watchdog_without_patience_is_warned_of(caplog: pytest.LogCaptureFixture) -> None:
@@ -98,6 +129,7 @@ async def test_an_abstract_socket_is_reached_and_one_that_is_gone_is_only_counte
     manager.socket.close()
     service.on_second(state_of(State.OK))
     assert service.failed == 1
+    await service.close(state_of(State.OK))
 
 
 @pytest.mark.parametrize("environment", [{}, {"NOTIFY_SOCKET": ""}, {"NOTIFY_SOCKET": "vsock:2:1234"}])

@@ -342,6 +342,28 @@ def test_damaged_file_is_replaced(sample: Sample, damage: bytes | None) -> None:
     assert sample.run().events == []
 
 
+@pytest.mark.parametrize("wrong", ["group", "others", "owner"])
+def test_a_file_that_others_may_have_written_is_not_run(sample: Sample, wrong: str) -> None:
+    sample.run()
+    prefix = ""
+    for path in sample.cache.glob("*.total-*.kernel"):
+        assert path.stat().st_mode & 0o022 == 0
+        if wrong == "owner":
+            if os.geteuid():  # nobody but root gives files away: then we are somebody else
+                prefix = f"import os; os.geteuid = lambda: {os.geteuid() + 1}\n"
+            else:
+                os.chown(path, 12345, -1)
+        else:
+            path.chmod(0o664 if wrong == "group" else 0o646)
+    distrustful = sample.run(prefix=prefix)
+    assert distrustful.answer == [6.0, 3.0]
+    assert distrustful.count("compiling") >= 1
+    told = [event["detail"] for event in distrustful.events if event["what"] == "warning"]
+    assert any(("belongs to user" if wrong == "owner" else "can be written by others") in each for each in told)
+    if not prefix:  # what was compiled takes its place
+        assert sample.run().events == []
+
+
 def test_another_processor_has_its_own_files(warmed: tuple[Sample, Outcome]) -> None:
     # GIVEN a cache for any processor, WHEN a process wants this one's own
     sample, _ = warmed

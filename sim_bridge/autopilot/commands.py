@@ -123,9 +123,10 @@ class CommandHandler:
             return DENIED
         if mode is FlightMode.TAKEOFF:
             return self._climb(self._takeoff_height_m())
-        return self._enter(mode)
+        return self.enter(mode)
 
-    def _enter(self, mode: FlightMode) -> int:
+    def enter(self, mode: FlightMode) -> int:
+        """Go over to a mode, whoever wants it; the MAV_RESULT."""
         if not self._vehicle.landed:
             if mode is FlightMode.MISSION:
                 self._vehicle.follow_path()
@@ -160,7 +161,7 @@ class CommandHandler:
         return ACCEPTED
 
     def _land(self, _command: Command, _now: float) -> int:
-        return self._state.flavour.refuse_now if self._vehicle.landed else self._enter(FlightMode.LAND)
+        return self._state.flavour.refuse_now if self._vehicle.landed else self.enter(FlightMode.LAND)
 
     def _go_to(self, command: Command, now: float) -> int:
         state = self._state
@@ -182,7 +183,7 @@ class CommandHandler:
     def _start_mission(self, _command: Command, _now: float) -> int:
         if self._vehicle.landed:
             return self._state.flavour.refuse_now
-        return self._enter(FlightMode.MISSION)
+        return self.enter(FlightMode.MISSION)
 
     def _reboot(self, command: Command, _now: float) -> int:
         wanted, force = command.params[0], command.params[5]

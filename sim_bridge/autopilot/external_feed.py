@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -50,6 +50,9 @@ class Fed:
 
     position_m: Array
     velocity_mps: Array | None
+    position_sigma_m: Array = field(default_factory=lambda: np.full(3, 0.3))
+    """Per axis, as this autopilot reads the covariance."""
+    velocity_sigma_mps: Array = field(default_factory=lambda: np.full(3, 0.1))
 
 
 class Refused(Exception):
@@ -103,6 +106,12 @@ class ExternalFeed:
         self.reset_counter = int(message.reset_counter)
         return fed
 
+    def uses_gps(self) -> bool:
+        """Whether navigation uses its own receiver: PX4 by EKF2_GPS_CTRL, ArduPilot by its source set."""
+        if self._flavour.name == "px4":
+            return bool(int(self._parameter("EKF2_GPS_CTRL")) & 1)
+        return self._parameter(f"EK3_SRC{min(self.source_set, 2)}_POSXY") == 3
+
     def healthy(self, now: float) -> bool:
         """Whether samples came lately enough for the autopilot."""
         if self._flavour.name == "px4":
@@ -133,7 +142,8 @@ class ExternalFeed:
             velocity = np.array(rotated((w, x, y, z), (message.vx, message.vy, message.vz)))
         else:
             velocity = _to_ned((message.vx, message.vy, message.vz), message.child_frame_id)
-        return Fed(position, velocity if np.isfinite(velocity).all() else None)
+        known = velocity if np.isfinite(velocity).all() else None
+        return Fed(position, known, _sigmas(message.pose_covariance, 0.1), _sigmas(message.velocity_covariance, 0.1))
 
     def _ardupilot(self, message: Any) -> Fed:
         if self._parameter("VISO_TYPE") == 0:
@@ -150,7 +160,18 @@ class ExternalFeed:
         if quaternion is None:
             raise Refused("no attitude")
         velocity = np.array(rotated(quaternion, (message.vx, message.vy, message.vz)))
-        return Fed(np.array((message.x, message.y, message.z)), velocity if np.isfinite(velocity).all() else None)
+        known = velocity if np.isfinite(velocity).all() else None
+        c, least_m = message.pose_covariance, self._parameter("VISO_POS_M_NSE")
+        seen_m = least_m if math.isnan(c[0]) else math.cbrt(c[0] ** 2 + c[6] ** 2 + c[11] ** 2)
+        sigma_m = np.full(3, min(max(seen_m, least_m), 100.0))
+        position = np.array((message.x, message.y, message.z))
+        return Fed(position, known, sigma_m, np.full(3, self._parameter("VISO_VEL_M_NSE")))
+
+
+def _sigmas(covariance: Any, least: float) -> Array:
+    """Per axis of PX4's parameters and a MAVLink covariance; ``least`` where that says nothing."""
+    variances = np.array((covariance[0], covariance[6], covariance[11]))
+    return np.asarray(np.sqrt(np.maximum(np.nan_to_num(variances, nan=least**2), least**2)))
 
 
 def _to_ned(vector: tuple[float, float, float], frame: int) -> Array:

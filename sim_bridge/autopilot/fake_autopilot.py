@@ -19,8 +19,9 @@ from agent.sensing.frames import FleetFrame, rotated
 from sim_bridge.autopilot import mavlink_wire as wire
 from sim_bridge.autopilot.commands import Command, CommandHandler
 from sim_bridge.autopilot.external_feed import Refused
-from sim_bridge.autopilot.flavours import FLAVOURS, STREAM_GROUPS
+from sim_bridge.autopilot.flavours import FLAVOURS, STREAM_GROUPS, FlightMode
 from sim_bridge.autopilot.mavlink_wire import Message
+from sim_bridge.autopilot.navigation import OutsideState
 from sim_bridge.autopilot.state import AutopilotState, AutopilotVehicle, CrystalClock, ParameterTable
 from sim_bridge.autopilot.stream_messages import StreamMessages
 from sim_bridge.autopilot.streams import StreamTable
@@ -40,7 +41,8 @@ class AutopilotSetup:
 
     ``sensor_rates_hz`` by message id bounds the streams; ``gravity_mps2`` is what the autopilot takes from
     its accelerometers; ``unix_offset_s`` is Unix time minus the clock of ``now``; ``gps_time_unknown`` sends
-    GPS stamps of zero, as PX4 does when it has no UTC. With a ``signing_key`` it signs, and takes signed frames only.
+    GPS stamps of zero, as PX4 does when it has no UTC; ``fusing`` navigates by a filter with the firmware's
+    figures (`sim_bridge.autopilot.fusing`). With a ``signing_key`` it signs, and takes signed frames only.
     """
 
     flavour: FlavourName
@@ -51,6 +53,7 @@ class AutopilotSetup:
     clock_skew_ppm: float = 0.0
     stamp_quantum_us: int = 1
     gps_time_unknown: bool = False
+    fusing: bool = False
     signing_key: bytes | None = None
     sensor_rates_hz: dict[int, float] = field(default_factory=dict)
 
@@ -113,6 +116,7 @@ class FakeAutopilot:
             self._parameters,
             StreamTable(flavour, limits),
             airborne=not self._vehicle.landed,
+            fusing=setup.fusing,
         )
         self._encoder = Encoder(setup.system_id, COMPONENT, self._signing)
         self._messages = StreamMessages(self.state, self._vehicle, setup.unix_offset_s, setup.system_id)
@@ -150,6 +154,7 @@ class FakeAutopilot:
             return []
         self._set_time(now)
         self._navigate(now)
+        self._look_after_position(now)
         if now >= self._heartbeat_s:
             self._send(self._messages.heartbeat())
             self._heartbeat_s = max(self._heartbeat_s + HEARTBEAT_S, now)
@@ -173,7 +178,8 @@ class FakeAutopilot:
         self._last_fix = (fix, taken_s)
         if fix.valid:
             self._last_fix_s = now
-            state.navigation.on_fix(fix, now)
+            if not self.setup.fusing or state.feed.uses_gps():
+                state.navigation.on_fix(fix, now)
             if state.home_m is None:
                 state.home_m = np.array(fix.position_ned_m)
         elif state.flavour.name == "px4":
@@ -210,6 +216,18 @@ class FakeAutopilot:
             attitude, imu = navigation.attitude(self._vehicle.attitude()), self._vehicle.imu()
             north, east, down = rotated(quaternion_of(attitude), vector_of(imu.accel_mps2))
             navigation.predict(np.array((north, east, down + self.setup.gravity_mps2)), now)
+
+    def _look_after_position(self, now: float) -> None:
+        """The estimator's failsafe, where it has one: of an armed vehicle that was once located and is in the air."""
+        state = self.state
+        flies = state.armed and not self._vehicle.landed and state.navigation.origin_m is not None
+        if state.failsafe is None or not flies:
+            return
+        mode = state.failsafe.step(state.mode, state.navigation.unaided_s(now), now)
+        if mode is not None:
+            self._commands.enter(mode)
+            text = "EKF Failsafe: LAND" if mode is FlightMode.LAND else "EKF failsafe cleared"
+            self._send(wire.statustext(mavlink.MAV_SEVERITY_CRITICAL, text))
 
     def _send(self, message: Message) -> None:
         self._out.append(self._encoder.encode(message))
@@ -265,6 +283,7 @@ class FakeAutopilot:
             self._send(mavlink.MAVLink_timesync_message(self.state.clock.ns(now), message.ts1))
         else:
             self.counters.timesync_replies += 1
+            self.state.feed_clock.on_timesync(message.tc1 * 1e-9, now)
 
     def _on_ping(self, message: Message, now: float) -> None:
         if message.target_system == 0 and message.target_component == 0:
@@ -342,9 +361,18 @@ class FakeAutopilot:
             self._send(wire.statustext(mavlink.MAV_SEVERITY_CRITICAL, f"ODOMETRY: {refused.reason} rejected"))
             return
         origin_m = state.navigation.origin_m
-        gps_lately = now - self._last_fix_s < GPS_SILENCE_S
-        if fed is not None and origin_m is not None and state.feed.fused(now) and not gps_lately:
-            state.navigation.correct(origin_m + fed.position_m, fed.velocity_mps, now)
+        held_by_gps = now - self._last_fix_s < GPS_SILENCE_S and not self.setup.fusing
+        taken_s = state.feed_clock.taken_s(getattr(message, "time_usec", getattr(message, "usec", 0)), now)
+        if fed is not None and origin_m is not None and state.feed.fused(now) and not held_by_gps:
+            outside = OutsideState(
+                origin_m + fed.position_m,
+                fed.velocity_mps,
+                fed.position_sigma_m,
+                fed.velocity_sigma_mps,
+                taken_s,
+                int(message.reset_counter),
+            )
+            state.navigation.on_outside(outside, now)
 
 
 def _text(name: bytes | str) -> str:

@@ -109,6 +109,8 @@ PX4 = Flavour(
         "MIS_TAKEOFF_ALT": Parameter(2.5, integer=False),
         "EKF2_EV_CTRL": Parameter(7),
         "EKF2_EV_DELAY": Parameter(0.0, integer=False),
+        "EKF2_EV_NOISE_MD": Parameter(0),
+        "EKF2_EV_QMIN": Parameter(0),
         "EKF2_GPS_CTRL": Parameter(7),
         "EKF2_HGT_REF": Parameter(1),
     },
@@ -162,10 +164,13 @@ ARDUPILOT = Flavour(
         "GPS1_TYPE": Parameter(1),
         "VISO_TYPE": Parameter(1),
         "VISO_POS_M_NSE": Parameter(0.2, integer=False),
+        "VISO_VEL_M_NSE": Parameter(0.1, integer=False),
         "VISO_QUAL_MIN": Parameter(0),
+        "VISO_DELAY_MS": Parameter(150),
         "EK3_SRC1_POSXY": Parameter(3),
         "EK3_SRC2_POSXY": Parameter(6),
         "EK3_SRC2_VELXY": Parameter(6),
+        "EK3_SRC2_YAW": Parameter(1),
     },
 )
 """ArduCopter 4.6 without HIGHRES_IMU, its stream groups (SRx) at zero: nothing comes unless asked for."""

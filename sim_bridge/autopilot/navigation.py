@@ -6,6 +6,8 @@ where the autopilot first knew its position.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from sim_bridge.world.quaternions import Array
@@ -16,6 +18,18 @@ PERIOD_S = 0.02
 POSITION_GAIN = 0.3
 VELOCITY_GAIN = 0.5
 VELOCITY_FROM_POSITION_PER_S = 0.3
+
+
+@dataclass(frozen=True, slots=True)
+class OutsideState:
+    """A position from outside in the fleet frame, NED, its 1-sigmas per axis, and the instant it is taken for."""
+
+    position_m: Array
+    velocity_mps: Array | None
+    position_sigma_m: Array
+    velocity_sigma_mps: Array
+    taken_s: float
+    reset_counter: int
 
 
 class Navigation:
@@ -36,6 +50,14 @@ class Navigation:
     def aided(self, now: float) -> bool:
         """Whether a position came lately."""
         return self.origin_m is not None and now - self._aided_s <= AIDED_S
+
+    def unaided_s(self, now: float) -> float:
+        """Since a position was used."""
+        return now - self._aided_s
+
+    def ratio(self, now: float) -> float:
+        """Of the horizontal innovation and its gate, as the autopilot tells it."""
+        return 0.1 if self.aided(now) else 1.0
 
     def set_origin(self, origin_m: Array) -> None:
         """Set the origin (of an autopilot that never had a fix) and start there."""
@@ -67,6 +89,10 @@ class Navigation:
         else:
             self.velocity_mps = self.velocity_mps + VELOCITY_GAIN * (velocity_mps - self.velocity_mps)
         self._aided_s = now
+
+    def on_outside(self, outside: OutsideState, now: float) -> None:
+        """Use a position from outside, as if it were of now."""
+        self.correct(outside.position_m, outside.velocity_mps, now)
 
     def on_fix(self, fix: GpsFix, now: float) -> None:
         """Use a valid fix of the autopilot's own receiver."""

@@ -8,7 +8,10 @@ from typing import Protocol
 
 from agent.sensing.frames import FleetFrame
 from sim_bridge.autopilot.external_feed import ExternalFeed
+from sim_bridge.autopilot.failsafe import EstimatorFailsafe
+from sim_bridge.autopilot.feed_clock import FeedClock
 from sim_bridge.autopilot.flavours import Flavour, FlightMode, Parameter
+from sim_bridge.autopilot.fusing import FIGURES, FusingNavigation
 from sim_bridge.autopilot.navigation import Navigation
 from sim_bridge.autopilot.streams import StreamTable
 from sim_bridge.autopilot.truth_messages import TrueState
@@ -136,13 +139,17 @@ class AutopilotState:
         streams: StreamTable,
         *,
         airborne: bool,
+        fusing: bool = False,
     ) -> None:
+        """``fusing``: whether it navigates by a filter with the firmware's figures, and lands without positions."""
         self.flavour = flavour
         self.frame = frame
         self.clock = clock
         self.parameters = parameters
         self.streams = streams
-        self.navigation = Navigation()
+        self.navigation = FusingNavigation(flavour.name) if fusing else Navigation()
+        self.failsafe = EstimatorFailsafe(FIGURES[flavour.name]) if fusing else None
+        self.feed_clock = FeedClock(flavour.name, parameters.value)
         self.feed = ExternalFeed(flavour, parameters.value)
         self.armed = airborne
         self.mode = FlightMode.MISSION if airborne else FlightMode.HOLD

@@ -166,8 +166,8 @@ class StreamMessages:
 
     def _flags(self, now: float) -> tuple[int, float]:
         """EKF_STATUS flags and test ratio; ESTIMATOR_STATUS uses the same bits for what we simulate."""
-        good = self._state.navigation.aided(now)
-        return (EKF_ALL_GOOD, 0.1) if good else (EKF_ATTITUDE_ONLY, 1.0)
+        navigation = self._state.navigation
+        return (EKF_ALL_GOOD if navigation.aided(now) else EKF_ATTITUDE_ONLY), navigation.ratio(now)
 
     def _estimator_status(self, now: float) -> Message:
         flags, ratio = self._flags(now)

@@ -93,6 +93,8 @@ class Scenario:
     """False: pairs have the bias of modules as delivered, 0.3 m on average."""
     gps_speed: Literal["horizontal", "norm"] = "horizontal"
     """What GPS_RAW_INT.vel holds: ground speed, as receivers have it, or the velocity's norm (the paper)."""
+    fusing: bool = False
+    """Autopilots navigate as the firmware does, and vehicles fly by that."""
     max_accel_mps2: float = 2.0
     yaw_rate_radps: float = 0.0
     """All vehicles turn at it."""

@@ -32,6 +32,7 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         uwb_hz=sim.uwb_hz,
         uwb_staggered=sim.profile != "paper",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
+        fusing=sim.autopilots == "fusing",
         yaw_rate_radps=sim.yaw_rate_radps,
         gps_outages=tuple(Interval(o.agent, o.from_s, o.to_s) for o in sim.gps_outages),
         faults=sim.faults,

@@ -92,6 +92,9 @@ class SimTable(Table, frozen=True):
     `fleetloc uwb`; or, with none, the simulator's own driver, which sends frames."""
     yaw_rate_radps: Annotated[float, msgspec.Meta(ge=-3, le=3)] = 0.0
     """At which all drones turn about the vertical."""
+    autopilots: Literal["plain", "fusing"] = "plain"
+    """How they navigate: by fixed gains, or by a filter that uses, refuses and loses positions as the firmware does;
+    drones then fly by what it believes, and land without positions."""
     gps_outages: tuple[GpsOutage, ...] = ()
     """When which receivers see nothing."""
     faults: tuple[FaultTable, ...] = ()

@@ -155,6 +155,7 @@ class Simulation:
             clock_skew_ppm=vehicle.clock_skew_ppm,
             stamp_quantum_us=vehicle.stamp_quantum_us,
             gps_time_unknown=vehicle.gps_time_unknown,
+            fusing=scenario.fusing,
             signing_key=self._signing_keys.get(vehicle.agent),
             sensor_rates_hz=rates,
         )
@@ -196,7 +197,17 @@ class Simulation:
             self.autopilots[ids[slot]].on_fix(fix, self.start_s + fix.time_s, now)
         for agent, autopilot in self.autopilots.items():
             self._send(agent, autopilot.advance(now), outputs.frames)
+        if self.scenario.fusing:
+            self._fly_by_belief()
         outputs.ranges += [(now, ranges) for ranges in self.sensors.ranges()]
+
+    def _fly_by_belief(self) -> None:
+        """Vehicles are guided by where their autopilots believe to be, once they believe anything."""
+        for slot, autopilot in enumerate(self.autopilots.values()):
+            navigation = autopilot.state.navigation
+            if navigation.origin_m is not None:
+                self.world.off_m[slot] = navigation.position_m - self.world.position_m[slot]
+                self.world.off_mps[slot] = navigation.velocity_mps - self.world.velocity_mps[slot]
 
     def _send(self, agent: int, frames: list[bytes], sent: list[tuple[int, bytes]]) -> None:
         if frames and self._silent(agent):

@@ -64,6 +64,9 @@ class FleetWorld:
         self.dynamics = dynamics or Dynamics()
         self.position_m = np.array(position_m, float)
         self.velocity_mps = np.array(velocity_mps, float)
+        self.off_m: Array = np.zeros((count, 3))
+        """How far from where they are their guidance has the vehicles."""
+        self.off_mps: Array = np.zeros((count, 3))
         self.accel_mps2: Array = np.zeros((count, 3))
         self.yaw_rad = np.zeros(count) if yaw_rad is None else np.array(yaw_rad, float)
         self._yaw_step_rad = yaw_rate_radps / STEP_RATE_HZ
@@ -107,7 +110,11 @@ class FleetWorld:
             path.reference(self.time_s - begun_s) for path, begun_s in zip(self._paths, self._begun_s, strict=True)
         ]
         self._command_mps2 = command(
-            self._gain, references, self.position_m, self.velocity_mps, self.dynamics.max_accel_mps2
+            self._gain,
+            references,
+            self.position_m + self.off_m,
+            self.velocity_mps + self.off_mps,
+            self.dynamics.max_accel_mps2,
         )
 
     def _touch_down(self) -> None:

@@ -1,0 +1,181 @@
+"""An autopilot's navigation as a Kalman filter that uses, refuses, resets and times out with the firmware's figures.
+
+Per axis a position and a velocity, predicted with the measured acceleration. Positions from outside count at the
+instant for which they are taken. A gate refuses them; the state is set to them when they announce a reset, when
+nothing else holds it, or when they were refused for too long. Figures: PX4 1.16 in SIH and ArduCopter 4.7 in SITL.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from sim_bridge.autopilot.navigation import Navigation, OutsideState
+from sim_bridge.world.noise import FlavourName
+from sim_bridge.world.quaternions import Array
+from sim_bridge.world.sensors import GpsFix
+
+ACCEL_SIGMA_MPS2 = 0.35
+POSITION_GATE, VELOCITY_GATE = 5.0, 3.0
+START_SIGMA_M, START_SIGMA_MPS = 1.0, 0.5
+REMEMBERED_S = 1.0
+"""How old a position may be and still be put where it belongs."""
+GPS_STOPPED_S = 1.0
+"""Without a fix for so long, GPS holds nothing any more, and a feed that begins sets the state."""
+GPS_SPEED_SIGMA_MPS = 0.3
+LEAST_SIGMA_M, LEAST_SIGMA_MPS = 0.1, 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class LossFigures:
+    """What follows so many seconds after the last position that was used."""
+
+    flag_s: float
+    """Its estimator no longer says that it has a position."""
+    failsafe_s: float
+    """It lands."""
+    refused_s: float
+    """Positions that were refused for so long are set, not fused, if nothing else holds the state."""
+    returns_after_s: float | None
+    """Its earlier mode comes back when it has positions again for so long; ``None``: it stays in LAND."""
+
+
+FIGURES: dict[FlavourName, LossFigures] = {
+    "px4": LossFigures(flag_s=0.7, failsafe_s=4.5, refused_s=1.0, returns_after_s=2.0),
+    "ardupilot": LossFigures(flag_s=7.0, failsafe_s=8.0, refused_s=7.0, returns_after_s=None),
+}
+
+
+class FusingNavigation(Navigation):
+    """Of one flavour; counters by name of what became of what came."""
+
+    def __init__(self, flavour: FlavourName) -> None:
+        super().__init__()
+        self.figures = FIGURES[flavour]
+        self.refused = self.resets = 0
+        self._covariance: Array = np.zeros((3, 2, 2))
+        """Of position and velocity, each axis."""
+        self._past: deque[tuple[float, Array, Array]] = deque()
+        self._ratio = 0.0
+        self._gps_s = self._refused_since_s = -np.inf
+        self._feed_s = -np.inf
+        self._reset_counter: int | None = None
+
+    def aided(self, now: float) -> bool:
+        """Whether a position was used lately enough for this autopilot."""
+        return self.origin_m is not None and self.unaided_s(now) <= self.figures.flag_s
+
+    def ratio(self, now: float) -> float:
+        """Of the last horizontal innovation and its gate; above 1 it was refused."""
+        return self._ratio
+
+    def set_origin(self, origin_m: Array) -> None:
+        """Set the origin and start there."""
+        super().set_origin(origin_m)
+        self._covariance[:] = np.diag((START_SIGMA_M**2, START_SIGMA_MPS**2))
+
+    def predict(self, accel_ned_mps2: Array, now: float) -> None:
+        """Integrate the measured acceleration ``(3,)`` NED, gravity removed, up to now."""
+        before_s = self._predicted_s
+        super().predict(accel_ned_mps2, now)
+        if before_s is None or self.origin_m is None:
+            return
+        step_s = now - before_s
+        move = np.array(((1.0, step_s), (0.0, 1.0)))
+        noise = np.array((0.5 * step_s**2, step_s))
+        self._covariance = move @ self._covariance @ move.T + ACCEL_SIGMA_MPS2**2 * np.outer(noise, noise)
+        self._past.append((now, self.position_m, self.velocity_mps))
+        while now - self._past[0][0] > REMEMBERED_S:
+            self._past.popleft()
+
+    def on_fix(self, fix: GpsFix, now: float) -> None:
+        """Use a valid fix of the autopilot's own receiver."""
+        sigmas = np.maximum((fix.h_acc_m, fix.h_acc_m, fix.v_acc_m), LEAST_SIGMA_M)
+        position, velocity = np.array(fix.position_ned_m), np.array(fix.velocity_ned_mps)
+        if self.origin_m is None:
+            self.set_origin(position)
+            self.velocity_mps = velocity
+        alone = now - self._feed_s > GPS_STOPPED_S
+        if self._use(position, velocity, sigmas, np.full(3, GPS_SPEED_SIGMA_MPS), now, now, alone):
+            self._gps_s = now
+
+    def on_outside(self, outside: OutsideState, now: float) -> None:
+        """Use a position from outside."""
+        if self.origin_m is None:
+            return
+        alone = now - self._gps_s > GPS_STOPPED_S
+        begins = alone and now - self._feed_s > GPS_STOPPED_S
+        announced = self._reset_counter is not None and outside.reset_counter != self._reset_counter
+        self._reset_counter = outside.reset_counter
+        if begins or (announced and alone):
+            self._set(outside.position_m, outside.velocity_mps, outside.taken_s, now)
+            self._feed_s = now
+            return
+        sigmas = np.maximum(outside.position_sigma_m, LEAST_SIGMA_M)
+        speeds = np.maximum(outside.velocity_sigma_mps, LEAST_SIGMA_MPS)
+        if self._use(outside.position_m, outside.velocity_mps, sigmas, speeds, outside.taken_s, now, alone):
+            self._feed_s = now
+
+    def _use(
+        self,
+        position_m: Array,
+        velocity_mps: Array | None,
+        sigma_m: Array,
+        sigma_mps: Array,
+        taken_s: float,
+        now: float,
+        alone: bool,
+    ) -> bool:
+        """Fuse a position (and velocity) taken at ``taken_s``, or refuse it; whether it was used."""
+        then_m, then_mps = self._at(taken_s)
+        off_m = position_m - then_m
+        gate = POSITION_GATE**2 * (self._covariance[:, 0, 0] + sigma_m**2)
+        self._ratio = float(np.max((off_m**2 / gate)[:2]))
+        if self._ratio > 1.0:
+            self.refused += 1
+            self._refused_since_s = now if self._refused_since_s == -np.inf else self._refused_since_s
+            if not (alone and now - self._refused_since_s >= self.figures.refused_s):
+                return False
+            self._set(position_m, velocity_mps, taken_s, now)
+            return True
+        self._refused_since_s = -np.inf
+        self._fuse(0, off_m, sigma_m)
+        if velocity_mps is not None and np.isfinite(velocity_mps).all():
+            off_mps = velocity_mps - then_mps
+            within = off_mps**2 <= VELOCITY_GATE**2 * (self._covariance[:, 1, 1] + sigma_mps**2)
+            self._fuse(1, off_mps, np.where(within, sigma_mps, np.inf))
+        self._aided_s = now
+        return True
+
+    def _fuse(self, row: int, off: Array, sigma: Array) -> None:
+        """One Kalman update per axis; an infinite sigma changes nothing."""
+        covariance = self._covariance
+        gain = covariance[:, :, row] / (covariance[:, row, row] + sigma**2)[:, None]
+        self._covariance = covariance - gain[:, :, None] * covariance[:, None, row, :]
+        shift_m, shift_mps = gain[:, 0] * off, gain[:, 1] * off
+        self._shift(shift_m, shift_mps)
+
+    def _shift(self, shift_m: Array, shift_mps: Array) -> None:
+        """Correct the state, and what is remembered of it, so that the next innovation knows."""
+        self.position_m = self.position_m + shift_m
+        self.velocity_mps = self.velocity_mps + shift_mps
+        self._past = deque((t, p + shift_m, v + shift_mps) for t, p, v in self._past)
+
+    def _set(self, position_m: Array, velocity_mps: Array | None, taken_s: float, now: float) -> None:
+        """A reset: the state is what came, carried on to now."""
+        then_m, then_mps = self._at(taken_s)
+        shift_mps = np.zeros(3) if velocity_mps is None else velocity_mps - then_mps
+        self._shift(position_m - then_m + (now - taken_s) * shift_mps, shift_mps)
+        self._covariance[:] = np.diag((START_SIGMA_M**2, START_SIGMA_MPS**2))
+        self._refused_since_s = -np.inf
+        self._aided_s = now
+        self.resets += 1
+
+    def _at(self, taken_s: float) -> tuple[Array, Array]:
+        """Its position and velocity at an instant that it remembers, the nearest one."""
+        if not self._past:
+            return self.position_m, self.velocity_mps
+        _, position_m, velocity_mps = min(self._past, key=lambda each: abs(each[0] - taken_s))
+        return position_m, velocity_mps

@@ -87,8 +87,15 @@ class AgentCore:
     """
 
     def __init__(
-        self, config: FleetConfig, agent_id: int, make_estimator: EstimatorFactory, timeline: Timeline
+        self,
+        config: FleetConfig,
+        agent_id: int,
+        make_estimator: EstimatorFactory,
+        timeline: Timeline,
+        first_tick: int | None = None,
     ) -> None:
+        """``first_tick`` is waited for: those before it were another core's."""
+        self._first_tick = first_tick
         self._config = config
         self._agent_id = agent_id
         self._own = config.agent(agent_id)
@@ -124,6 +131,13 @@ class AgentCore:
         self._exchange = 0
         self._clock_s = -math.inf
         """When `advance` was called last."""
+
+    @property
+    def next_tick(self) -> int | None:
+        """The first tick of which nobody has heard anything of this core yet."""
+        if self._tick is None:
+            return self._first_tick
+        return self._tick if self._phase is _Phase.END else self._tick + 1
 
     # --- what comes in -------------------------------------------------------------------------------------
 
@@ -184,7 +198,7 @@ class AgentCore:
             self.counters["packet: not a neighbour"] += 1
             return
         if self._tick is None:
-            self._enter(tick_of(now_s, self._period_s))
+            self._enter(self._tick_at(now_s))
         self.neighbours.on_packet(received.sender, now_s)
         if isinstance(message, Measurements):
             self._on_measurements(received.sender, message)
@@ -277,7 +291,7 @@ class AgentCore:
         self._link_state, self._clock_s = link_state, now_s
         outputs: list[CoreOutput] = []
         if self._tick is None:
-            self._enter(tick_of(now_s, self._period_s))
+            self._enter(self._tick_at(now_s))
         if now_s > self._end_s + MAX_BEHIND_TICKS * self._period_s:
             self._leave_out_ticks(now_s)
         while self._survived_step(now_s, outputs):
@@ -312,6 +326,11 @@ class AgentCore:
                 return False
             self._mix(now_s, outputs)
         return True
+
+    def _tick_at(self, now_s: float) -> int:
+        """Which tick to begin with."""
+        tick = tick_of(now_s, self._period_s)
+        return tick if self._first_tick is None else max(tick, self._first_tick)
 
     def _enter(self, tick: int) -> None:
         """Begin to wait for the end of a tick."""

@@ -139,7 +139,9 @@ class Daemon:
         self._agent_id = agent_id
         self._periods = periods or Periods()
         self._link = create_link(parse_endpoint(config.agent(agent_id).mavlink), self._on_mavlink)
-        listener = Listener(self._on_packet, self._on_uwb, self._on_gone, self._on_clock_question)
+        listener = Listener(
+            self._on_packet, self._on_uwb, self._on_gone, self._on_clock_question, self._last_heard_s
+        )
         self.radio = Radio(config, agent_id, base, listener)
         identity = self.radio.identity
         unix_s, host_s = time.time(), time.monotonic()
@@ -301,6 +303,9 @@ class Daemon:
 
     def _on_clock_question(self, question: bytes, arrived_ns: int) -> bytes | None:
         return self.onboard.answer_clock(question, arrived_ns=arrived_ns, now_ns=time.time_ns())
+
+    def _last_heard_s(self, agent_id: int) -> float | None:
+        return self.onboard.opener.peers[agent_id].last_received_s
 
     def _on_gone(self, agent_id: int) -> None:
         with self._faults.survived("letting a neighbour go"):

@@ -36,7 +36,7 @@ from agent.outputs import (
     Tell,
     ToAutopilot,
 )
-from agent.sensing.clock import FleetClock, clock_fault
+from agent.sensing.clock import FleetClock, clock_fault, step_fault
 from agent.sensing.frames import gravity_mps2
 from agent.sensing.samples import Sample
 from agent.sensing.timeline import Timeline
@@ -238,7 +238,7 @@ class OnboardAgent:
         self.opener.expire(host_s)
         stepped = self.clock.sync(unix_s=unix_s, host_s=host_s)
         if stepped:
-            self.core = self._new_core()
+            self.core = self._new_core(first_tick=self.core.next_tick)
             self._cores += 1
         self._look_around(host_s)
         outputs: list[Output] = [ClockStepped()] if stepped else []
@@ -371,12 +371,13 @@ class OnboardAgent:
 
     def _look_around(self, host_s: float) -> None:
         """Say in the health why we reach nobody, as the tick fits no packet, or why others do not reach us."""
-        fault = clock_fault(self._config.fleet, self.unix_s(host_s))
+        fault = clock_fault(self._config.fleet, self.unix_s(host_s)) or step_fault(self.clock)
         fed = () if self.feeder is None else self.feeder.findings()
         held = (*clock_finding(fault), *self.agreement.observe(host_s), *fed, *self._told_by_shell)
         self.core.health.hold(held)
 
-    def _new_core(self) -> AgentCore:
+    def _new_core(self, first_tick: int | None = None) -> AgentCore:
+        """A core that begins now, but not before a tick: after a step back of the clock none comes twice."""
         period_s = self._config.fleet.period_s
         timeline = Timeline(period_s, gravity_mps2(self._config), self._config.sensors)
-        return AgentCore(self._config, self.agent_id, self._make_estimator, timeline)
+        return AgentCore(self._config, self.agent_id, self._make_estimator, timeline, first_tick)

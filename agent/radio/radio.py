@@ -17,7 +17,8 @@ from agent.config.tables import FleetConfig
 from agent.fleet.neighbourhood import is_limited
 from agent.radio.radio_faults import channel_settings
 from agent.radio.security import agent_session, credentials, expiry_warnings, new_salt
-from transport.errors import Rejected, RejectionCounter
+from agent.radio.session_watch import SessionWatch
+from transport.errors import Rejected, RejectionCounter, SessionError
 from transport.link.channel import Channel, ChannelSettings
 from transport.link.session import Handlers, Session, open_session
 from transport.link.streams import Stream, key_expression, parse_key
@@ -38,6 +39,8 @@ OnUwb = Callable[[bytes, float], None]
 OnGone = Callable[[int], None]
 OnClockQuestion = Callable[[bytes, int], bytes | None]
 """(question, UTC of its arrival in ns) -> the packet that answers it."""
+LastHeard = Callable[[int], float | None]
+"""Neighbour -> when its last authentic packet came, monotonic clock; ``None``: never."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,6 +51,7 @@ class Listener:
     on_uwb: OnUwb
     on_gone: OnGone
     on_clock_question: OnClockQuestion
+    last_heard_s: LastHeard
 
 
 class Radio:
@@ -79,7 +83,12 @@ class Radio:
             self._faults(None), seed=config.transport.seed, receiver=agent_id, neighbours=self._neighbours
         )
         self._flying = False
-        self._heard_s: dict[int, float] = {}
+        self._opened_s = 0.0
+        self._watch = SessionWatch(frozenset(each for each in self._neighbours if each > agent_id))
+        self._anew: asyncio.Task[None] | None = None
+        self._opened_anew = 0
+        self._lost = 0, 0
+        """Of the sessions before this one: what they failed to send, and shed."""
         self._redeclared = 0
         self._timer: asyncio.TimerHandle | None = None
         self._repair: asyncio.TimerHandle | None = None
@@ -89,23 +98,29 @@ class Radio:
 
     async def open(self) -> None:
         """Open the session, listen to the neighbours, then show that we are there; raises `SessionError`."""
+        self._session = await self._connected()
+        self._look_later()
+
+    async def _connected(self) -> Session:
         handlers = Handlers(self._on_sample, self._on_presence, self._on_clock_question)
         session = await open_session(self._settings, self._fleet, self._agent_id, self._config.ids, handlers)
-        self._heard_s = dict.fromkeys(self._neighbours, time.monotonic())
+        self._opened_s = time.monotonic()
         session.subscribe(self._agent_id, (Stream.UWB,))
         for neighbour in self._neighbours:
             session.subscribe(neighbour, (*USED_STREAMS, Stream.FAR) if is_limited(self._config) else USED_STREAMS)
         session.announce()
-        self._session = session
-        self._repair_later()
+        return session
 
     async def close(self) -> None:
         """Leave; neighbours see it at once."""
         for timer in (self._timer, self._repair):
             if timer is not None:
                 timer.cancel()
-        if self._session is not None:
-            await self._session.close()
+        if self._anew is not None:
+            self._anew.cancel()
+            await asyncio.gather(self._anew, return_exceptions=True)
+        if self._session is not None and not await self._session.close():
+            LOG.warning("agent %d: Zenoh does not let go of its links; not waited for", self._agent_id)
 
     def send(self, packets: Iterable[Packet]) -> None:
         """Put packets out, each on its stream; nothing while the session is not open."""
@@ -124,10 +139,11 @@ class Radio:
         """What this side counts."""
         session = self._session
         counts = {
-            "packets unsent": session.failed if session else 0,
-            "packets shed": session.shed if session else 0,
+            "packets unsent": self._lost[0] + (session.failed if session else 0),
+            "packets shed": self._lost[1] + (session.shed if session else 0),
             "injected losses": sum(self._channel.lost.values()),
             "subscriptions repeated": self._redeclared,
+            "sessions opened anew": self._opened_anew,
         }
         counts |= {f"rejected {reason}": count for reason, count in self._rejections.as_dict().items()}
         return counts | {f"rejected uwb {reason}": count for reason, count in self._uwb_rejections.as_dict().items()}
@@ -158,7 +174,6 @@ class Radio:
         if stream is Stream.UWB:
             self._take_uwb(key, payload, arrived_s)
             return
-        self._heard_s[sender] = arrived_s
         self._channel.offer(sender, (key, payload, arrived_s), arrived_s)
         self._deliver()
 
@@ -191,22 +206,48 @@ class Radio:
             began_s=began_s,
         )
 
-    def _repair_later(self) -> None:
-        after_s = REDECLARE_AFTER_S
-        self._repair = asyncio.get_running_loop().call_later(after_s, self._redeclare)
+    def _look_later(self) -> None:
+        self._repair = asyncio.get_running_loop().call_later(REDECLARE_AFTER_S, self._look_after)
 
-    def _redeclare(self) -> None:
+    def _look_after(self) -> None:
+        """What silent neighbours call for: what we listen to once more, or a new session."""
+        self._look_later()
+        if self._session is None:
+            return  # about to be opened anew
+        now_s = time.monotonic()
+        heard = {each: at_s for each in self._neighbours if (at_s := self._listener.last_heard_s(each)) is not None}
+        if self._watch.is_due(now_s, {each: max(at_s, self._opened_s) for each, at_s in heard.items()}):
+            self._anew = asyncio.get_running_loop().create_task(self._open_anew(self._session))
+            return
+        self._redeclare(now_s, heard)
+
+    def _redeclare(self, now_s: float, heard: dict[int, float]) -> None:
         """Tell silent neighbours again what we listen to.
 
         Zenoh tells a neighbour once per link, and a datagram that is lost is not repeated: it would send us nothing
         as long as the link lives.
         """
-        latest_s = time.monotonic() - REDECLARE_AFTER_S
-        for neighbour, heard_s in self._heard_s.items():
-            if self._session is not None and heard_s < latest_s:
+        for neighbour in self._neighbours:
+            at_s = max(heard.get(neighbour, self._opened_s), self._opened_s)
+            if self._session is not None and at_s < now_s - REDECLARE_AFTER_S:
                 self._session.resubscribe(neighbour)
                 self._redeclared += 1
-        self._repair_later()
+
+    async def _open_anew(self, deaf: Session) -> None:
+        """Leave, and come back as soon as the address is free again."""
+        LOG.warning("agent %d: neighbours fell silent; opening the session anew", self._agent_id)
+        self._session = None
+        self._lost = self._lost[0] + deaf.failed, self._lost[1] + deaf.shed
+        await deaf.close()
+        while True:
+            try:
+                self._session = await self._connected()
+            except SessionError as error:  # the old one has not let go of the address yet
+                LOG.debug("agent %d: %s", self._agent_id, error)
+                await asyncio.sleep(REDECLARE_AFTER_S)
+            else:
+                self._opened_anew += 1
+                return
 
     def _deliver(self) -> None:
         """Hand on what the channel lets through by now, and come back for what it delays."""

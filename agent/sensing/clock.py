@@ -18,6 +18,11 @@ STEP_S = 0.5
 """A larger difference is a step of the system's clock: fleet time follows at once."""
 
 
+MAX_BACK_S = 60.0
+"""A step back is followed up to here: until it is made up for nothing is estimated, for no tick may come twice. One
+that goes farther back is not followed; a restart does."""
+
+
 class FleetClock:
     """Fleet time is host (monotonic) time plus ``offset_s``.
 
@@ -29,15 +34,23 @@ class FleetClock:
         self.offset_s = unix_s - epoch_unix_s - host_s
         self._synced_s = host_s
         self.steps = 0
+        self.ahead_s = 0.0
+        """By how much fleet time is ahead of UTC after a step back that was not followed."""
 
     def fleet_s(self, host_s: float) -> float:
         """Fleet time of a host time."""
         return host_s + self.offset_s
 
     def sync(self, *, unix_s: float, host_s: float) -> bool:
-        """Compare with UTC, about once a second; true if fleet time stepped."""
+        """Compare with UTC, about once a second; true if fleet time stepped.
+
+        A step back by more than `MAX_BACK_S` leaves it as it is; ``ahead_s`` says by how much that is wrong.
+        """
         difference_s = unix_s - self._epoch_unix_s - host_s - self.offset_s
         elapsed_s, self._synced_s = max(host_s - self._synced_s, 0.0), host_s
+        self.ahead_s = -difference_s if difference_s < -MAX_BACK_S else 0.0
+        if self.ahead_s:
+            return False
         if abs(difference_s) > STEP_S:
             self.offset_s += difference_s
             self.steps += 1
@@ -53,6 +66,13 @@ def clock_fault(fleet: FleetTable, unix_s: float) -> str | None:
     if first_s <= unix_s <= last_s:
         return None
     return f"clock at {_date(unix_s)}, outside the fleet's time"
+
+
+def step_fault(clock: FleetClock) -> str | None:
+    """Why neighbours do not understand us after a step of the system's clock; ``None`` where they do."""
+    if not clock.ahead_s:
+        return None
+    return f"clock stepped back by {clock.ahead_s:.0f} s, not followed: start the daemon anew"
 
 
 def require_epoch(config: FleetConfig, *, unix_s: float) -> str | None:

@@ -44,7 +44,8 @@ class Target:
     """Agent 1 of a fleet as its daemon holds it: the radio, and the opener behind it."""
 
     def __init__(self, config: FleetConfig, base: Path) -> None:
-        self.radio = Radio(config, 1, base, Listener(self._on_packet, self._on_uwb, lambda _: None, self._on_clock))
+        listener = Listener(self._on_packet, self._on_uwb, lambda _: None, self._on_clock, lambda _: None)
+        self.radio = Radio(config, 1, base, listener)
         identity = self.radio.identity
         self.sealer = Sealer(config.fleet.name, 1, boot=identity.boot, signing=identity.signing)
         self.ranged: asyncio.Queue[bytes] = asyncio.Queue()

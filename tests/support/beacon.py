@@ -52,7 +52,7 @@ def diagnostics(config: FleetConfig, agent_id: int, *, seconds: int) -> Diagnost
 
 async def _fly(config_file: Path, agent_id: int) -> None:
     config = load_config(config_file)
-    listener = Listener(lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None)
+    listener = Listener(lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None)
     radio = Radio(config, agent_id, config_file.parent, listener)
     sealer = Sealer(config.fleet.name, agent_id, boot=radio.identity.boot, signing=radio.identity.signing)
     await radio.open()

@@ -7,6 +7,7 @@ event loop empties; whoever floods us loses packets, counted, before they cost m
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import re
 import threading
 import time
@@ -18,7 +19,6 @@ from typing import Any
 import zenoh
 
 from transport.errors import SessionError
-from transport.link.off_loop import off_loop
 from transport.link.session_settings import SessionSettings, zenoh_config
 from transport.link.streams import (
     Stream,
@@ -32,6 +32,8 @@ from transport.security.uwb_seal import UwbSeal
 
 _SOURCE_PLACE = re.compile(r" at /\S+:\d+\.?")
 """Zenoh's errors name places in its own source, which help nobody here."""
+CLOSE_S = 2.0
+"""Closing a session takes no longer; half a second is usual."""
 _BATCH = 256
 """Packets handed to their handler before the event loop turns to other things."""
 
@@ -210,14 +212,18 @@ class Session:
         """Peers with an open link at this moment."""
         return len(self._session.info.peers_zid())
 
-    async def close(self) -> None:
-        """Withdraw the token and leave; neighbours see it at once. Closing twice is harmless."""
+    async def close(self) -> bool:
+        """Withdraw the token and leave; neighbours see it at once. Closing twice is harmless.
+
+        False if Zenoh has not let go within `CLOSE_S`, as where its links are gone (10 s): then it does so later.
+        """
         if self._closed:
-            return
+            return True
         self._closed = True
-        await off_loop(self._close)
+        is_closed = await _within(CLOSE_S, self._close)
         with self._lock:
             self._inbox.clear()
+        return is_closed
 
     def _close(self) -> None:
         try:
@@ -302,6 +308,39 @@ class Session:
                 query.reply(key, answer)  # as urgent as the question was
             except zenoh.ZError:
                 self.failed += 1
+
+
+async def _within(most_s: float, function: Callable[[], None]) -> bool:
+    """Call on a thread that nobody waits for at the end of the program; whether it came to its end in time."""
+    ended: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def settle(error: BaseException | None) -> None:
+        if ended.cancelled():
+            return
+        if error is None:
+            ended.set_result(None)
+        else:
+            ended.set_exception(error)
+
+    def work(loop: asyncio.AbstractEventLoop) -> None:
+        error: BaseException | None = None
+        try:
+            function()
+        except BaseException as raised:  # noqa: BLE001  # handed on to whoever waits
+            error = raised
+        with contextlib.suppress(RuntimeError):  # the loop is over
+            loop.call_soon_threadsafe(settle, error)
+
+    try:
+        threading.Thread(target=work, args=(asyncio.get_running_loop(),), name="close", daemon=True).start()
+    except RuntimeError:  # the system has no more threads
+        function()
+        return True
+    try:
+        await asyncio.wait_for(ended, most_s)
+    except TimeoutError:
+        return False
+    return True
 
 
 async def open_session(

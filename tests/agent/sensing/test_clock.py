@@ -3,17 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import pairwise
 
 import pytest
-from hypothesis import given
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError
 from agent.onboard import OnboardAgent
-from agent.sensing.clock import FleetClock, require_epoch
+from agent.outputs import EstimateReady, Send
+from agent.sensing.clock import FleetClock, require_epoch, step_fault
 from agent.watch.health import State
 from estimators.factory import make_estimator
+from transport.messages.measurement_body import Measurements
 from transport.security.auth import Identity
 
 MakeConfig = Callable[..., FleetConfig]
@@ -35,10 +38,47 @@ def test_small_differences_are_slewed_and_time_never_goes_back() -> None:
 @given(st.floats(0.6, 1e6), st.booleans())
 def test_a_step_of_utc_is_followed_at_once_and_said(size_s: float, forward: bool) -> None:
     clock = FleetClock(0.0, unix_s=2e6, host_s=0.0)
+    size_s = size_s if forward else min(size_s, 59.0)
     jumped = 2e6 + 1.0 + (size_s if forward else -size_s)
     assert clock.sync(unix_s=jumped, host_s=1.0)
     assert clock.fleet_s(1.0) == pytest.approx(jumped)
     assert clock.steps == 1
+
+
+def test_a_step_far_back_is_not_followed_and_said(make_config: MakeConfig) -> None:
+    clock = FleetClock(0.0, unix_s=2e6, host_s=0.0)
+    assert not clock.sync(unix_s=2e6 + 1.0 - 3600.0, host_s=1.0)
+    assert clock.fleet_s(1.0) == pytest.approx(2e6 + 1.0)
+    assert step_fault(clock) == "clock stepped back by 3600 s, not followed: start the daemon anew"
+    # until it is right again
+    assert not clock.sync(unix_s=2e6 + 2.0, host_s=2.0)
+    assert step_fault(clock) is None
+
+
+@given(back_s=st.floats(0.6, 2.0), at_s=st.floats(0.0, 0.3))
+@settings(max_examples=8, suppress_health_check=[HealthCheck.function_scoped_fixture])
+def test_no_tick_comes_twice_after_a_step_back(make_config: MakeConfig, back_s: float, at_s: float) -> None:
+    # GIVEN an agent in flight, WHEN its clock is set back in the midst of whatever it does
+    config = make_config(2)
+    start_s = config.fleet.epoch_unix_s + 1000.0
+    agent = OnboardAgent(config, 1, make_estimator, Identity(), unix_s=start_s, host_s=0.0)
+    ticks, told, host_s, stepped = [], [], 0.0, False
+    while host_s < 3.0 + back_s:
+        outputs = agent.advance(host_s)
+        if host_s >= 1.0 + at_s and not stepped:
+            stepped = True
+            outputs += agent.keep_house(unix_s=start_s + host_s - back_s, host_s=host_s)
+        ticks += [each.estimate.tick for each in outputs if isinstance(each, EstimateReady)]
+        told += [each.message for each in outputs if isinstance(each, Send)]
+        host_s += 0.01
+    # THEN its estimates' ticks rise, it says nothing twice of a tick, and it comes back as soon as may be
+    assert all(later > earlier for earlier, later in pairwise(ticks))
+    sent = [(message.tick, message.exchange) for message in told if isinstance(message, Measurements)]
+    assert len(set(sent)) == len(sent)
+    now = (1000.0 + host_s - back_s) / config.fleet.period_s
+    assert ticks[-1] == pytest.approx(now, abs=3)
+    longest = max(later - earlier for earlier, later in pairwise(ticks))
+    assert longest <= 3
 
 
 def test_an_epoch_that_leaves_now_without_a_tick_is_refused(make_config: MakeConfig) -> None:

@@ -109,6 +109,7 @@ PX4 = Flavour(
         "MIS_TAKEOFF_ALT": Parameter(2.5, integer=False),
         "EKF2_EV_CTRL": Parameter(7),
         "EKF2_EV_DELAY": Parameter(0.0, integer=False),
+        "EKF2_DELAY_MAX": Parameter(300.0, integer=False),
         "EKF2_EV_NOISE_MD": Parameter(0),
         "EKF2_EV_QMIN": Parameter(0),
         "EKF2_GPS_CTRL": Parameter(7),

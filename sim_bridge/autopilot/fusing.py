@@ -51,8 +51,10 @@ FIGURES: dict[FlavourName, LossFigures] = {
 class FusingNavigation(Navigation):
     """Of one flavour; counters by name of what became of what came."""
 
-    def __init__(self, flavour: FlavourName) -> None:
+    def __init__(self, flavour: FlavourName, oldest_s: float = REMEMBERED_S) -> None:
+        """``oldest_s``: positions from outside that are older are left out."""
         super().__init__()
+        self._oldest_s = min(oldest_s, REMEMBERED_S)
         self.figures = FIGURES[flavour]
         self.refused = self.resets = 0
         self._covariance: Array = np.zeros((3, 2, 2))
@@ -104,6 +106,9 @@ class FusingNavigation(Navigation):
     def on_outside(self, outside: OutsideState, now: float) -> None:
         """Use a position from outside."""
         if self.origin_m is None:
+            return
+        if now - outside.taken_s > self._oldest_s:
+            self.refused += 1
             return
         alone = now - self._gps_s > GPS_STOPPED_S
         begins = alone and now - self._feed_s > GPS_STOPPED_S

@@ -147,7 +147,8 @@ class AutopilotState:
         self.clock = clock
         self.parameters = parameters
         self.streams = streams
-        self.navigation = FusingNavigation(flavour.name) if fusing else Navigation()
+        oldest_s = parameters.value("EKF2_DELAY_MAX") * 1e-3 if flavour.name == "px4" else math.inf
+        self.navigation = FusingNavigation(flavour.name, oldest_s) if fusing else Navigation()
         self.failsafe = EstimatorFailsafe(FIGURES[flavour.name]) if fusing else None
         self.feed_clock = FeedClock(flavour.name, parameters.value)
         self.feed = ExternalFeed(flavour, parameters.value)

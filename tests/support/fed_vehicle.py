@@ -14,14 +14,15 @@ from typing import Any
 import numpy as np
 
 from agent.config.reading import config_from
-from agent.feedback.feeder import FedAutopilot, Feeder, Ready
+from agent.feedback.feeder import FedAutopilot, Ready
 from agent.feedback.gatekeeper import FeedPhase
 from agent.mavlink.codec import Message
-from agent.mavlink.session import AutopilotSession, LinkState
-from agent.sensing.clock import FleetClock
+from agent.mavlink.session import LinkState
+from agent.onboard import OnboardAgent
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AttitudeSample, GpsSample
 from estimators.estimator import Status
+from estimators.factory import make_estimator
 from estimators.integrity.protection.levels import ErrorEllipse, ProtectionLevel
 from estimators.integrity.protection.statement import IntegrityState, Statement
 from estimators.model.measurements import Vector
@@ -31,6 +32,7 @@ from sim_bridge.world.guidance import Waypoints
 from sim_bridge.world.noise import FlavourName
 from sim_bridge.world.scenario import Interval, Scenario, Vehicle
 from sim_bridge.world.simulation import Simulation
+from transport.security.auth import Identity
 
 START_S, EPOCH_UNIX_S = 1000.0, 1_767_225_600.0
 AGE_S, PERIOD_S, SERVICE_S = 0.15, 0.1, 0.05
@@ -110,9 +112,9 @@ class FedVehicle:
             assert self.autopilot.state.parameters.store(name, encoded)
         if self.parameters:
             self.autopilot.reboot(START_S, 0.0)
-        self.clock = FleetClock(EPOCH_UNIX_S, unix_s=EPOCH_UNIX_S, host_s=START_S)
-        self.session = AutopilotSession(self.config, 1, self.clock, datagrams=True)
-        self.feeder = Feeder(self.config, 1)
+        agent = OnboardAgent(self.config, 1, make_estimator, Identity(), unix_s=EPOCH_UNIX_S, host_s=START_S)
+        assert agent.feeder is not None
+        self.session, self.feeder = agent.autopilot, agent.feeder  # its core is what the stand-in stands in for
         self.session.follower = lambda message, t_s, host_s: self.feeder.on_message(self.heard(message), t_s, host_s)
         self._rng = np.random.default_rng(self.seed)
         self._truth: list[tuple[float, Vector, Vector]] = []

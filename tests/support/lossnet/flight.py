@@ -166,6 +166,8 @@ class LossyFlight:
         process = subprocess.Popen(
             [*inside, sys.executable, "-m", module, *arguments],
             cwd=ROOT, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, text=True,
+            # as on a machine of its own: where sessions share one, what is flown gets no less than the tests' witness
+            start_new_session=True,
         )  # fmt: skip
         self._stack.callback(_end, process)
         return process

@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from agent.config.tables import FleetConfig
+from agent.config.tables import FleetConfig, TargetTable
 from agent.fleet.far_field import moments, moved_on
 from estimators.model.layout import Layout, block, position
 from fleetloc.monitor.alarms import DroneFacts, alarms_of_drone, alarms_of_fleet
 from fleetloc.monitor.links import LinkHistory, link_view, overdue_s
 from fleetloc.monitor.monitor_table import monitor_table
-from fleetloc.monitor.views import Alarm, Drone, Ellipse, Level, Link, Picture, SeenBy, Tracks, Triple
+from fleetloc.monitor.views import Alarm, Drone, Ellipse, Level, Link, Picture, SeenBy, Target, Tracks, Triple
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate, Matrix
 from transport.messages.far_body import FarReport, FarReports
 from transport.messages.report_body import Diagnostics
@@ -161,6 +161,21 @@ class FleetPicture:
             alarms=self._alarms(drones, now_s, unix_s),
             refused=dict(self._refusals),
             anchors=self._config.places_m,
+            targets=tuple(self._target(target, now_s) for target in self._config.targets),
+        )
+
+    def _target(self, target: TargetTable, now_s: float) -> Target:
+        seen = self._seen_by(target.id, now_s)
+        estimate = None if seen is None else self._heard[seen.agent_id].estimate
+        if estimate is None:
+            return Target(target_id=target.id, name=target.name)
+        place = position(Layout(estimate.agents).slot(target.id))
+        return Target(
+            target_id=target.id,
+            name=target.name,
+            seen_by=seen,
+            velocity_mps=_velocity(estimate, target.id),
+            ellipse=ellipse_of(np.diag(estimate.variance[place])),
         )
 
     def _drone(self, agent_id: int, now_s: float) -> Drone:
@@ -206,7 +221,7 @@ class FleetPicture:
         return state, STATE_LEVELS.get(state, "warning")
 
     def _seen_by(self, agent_id: int, now_s: float) -> SeenBy | None:
-        """What the neighbour who heard last of a drone has of it, of those that are heard themselves."""
+        """What the drone that heard last of another body has of it, of those that are heard themselves."""
         views = []
         for other, heard in self._heard.items():
             estimate = heard.estimate

@@ -8,7 +8,7 @@ from rich.console import Group, RenderableType
 from rich.table import Table
 from rich.text import Text
 
-from fleetloc.monitor.views import Alarm, Drone, Level, Link, Picture
+from fleetloc.monitor.views import Alarm, Drone, Level, Link, Picture, Target
 
 STYLES: dict[Level, str] = {"ok": "green", "info": "cyan", "warning": "yellow", "bad": "bold red"}
 COLUMNS = (
@@ -72,7 +72,8 @@ def table(picture: Picture, where: str) -> RenderableType:
         status = Text(drone.status, style=STYLES[drone.level])
         shown.add_row(_label(drone), status, *cells(drone, picture.links))
     alarms = [Text(f"{_alarm(picture, alarm)}", style=STYLES[alarm.level]) for alarm in picture.alarms[:MAX_ALARMS]]
-    return Group(shown, *(alarms or [Text("no alarms", style="green")]))
+    targets = [Text(_target(target)) for target in picture.targets]
+    return Group(shown, *targets, *(alarms or [Text("no alarms", style="green")]))
 
 
 def lines(picture: Picture) -> list[str]:
@@ -83,7 +84,19 @@ def lines(picture: Picture) -> list[str]:
         for drone in picture.drones
     ]
     alarms = [f"  {alarm.level}: {_alarm(picture, alarm)}" for alarm in picture.alarms]
-    return [f"{picture.fleet} {_clock(picture.unix_s)} UTC", *drones, *alarms]
+    targets = [f"  {_target(target)}" for target in picture.targets]
+    return [f"{picture.fleet} {_clock(picture.unix_s)} UTC", *drones, *targets, *alarms]
+
+
+def _target(target: Target) -> str:
+    label, seen, ellipse = f"target {target.target_id} {target.name}".strip(), target.seen_by, target.ellipse
+    if seen is None or ellipse is None:
+        return f"{label}: no drone has it"
+    north, east, down = seen.position_m
+    return (
+        f"{label}: N {north:.1f} E {east:.1f} up {-down:.1f} m, 3 sigma {ellipse.major_m:.2f}/{ellipse.up_m:.2f} m, "
+        f"age {seen.age_s:.1f} s, by drone {seen.agent_id}"
+    )
 
 
 def _label(drone: Drone) -> str:

@@ -63,6 +63,17 @@ class Drone(View, frozen=True):
     """Protection levels, horizontal and vertical."""
 
 
+class Target(View, frozen=True):
+    """A body of ``[[targets]]`` as the heard drone has it that knows it best; ``None`` where no drone has it."""
+
+    target_id: int
+    name: str
+    seen_by: SeenBy | None = None
+    velocity_mps: Triple | None = None
+    ellipse: Ellipse | None = None
+    """Its axes are north and east: what drones tell of other bodies has no covariances between axes."""
+
+
 class Link(View, frozen=True):
     """What ``receiver`` says of the packets of ``sender``."""
 
@@ -99,6 +110,7 @@ class Picture(View, frozen=True):
     """Packets that the monitor refused since its start, by reason."""
     anchors: dict[int, Triple] = {}
     """Where the anchors of the configuration are, by id."""
+    targets: tuple[Target, ...] = ()
 
 
 class Tracks(View, frozen=True):

@@ -18,6 +18,8 @@ from fleetloc.extras import is_installed, sentence
 from fleetloc.output import print_table, write_json
 from fleetloc.report.fleet_results import AgentTrack, FleetResults, Floats, load_results
 from fleetloc.report.report_html import page
+from fleetloc.report.target_results import COLUMNS as TARGET_COLUMNS
+from fleetloc.report.target_results import target_cells
 from fleetloc.run import run_files
 from fleetloc.run.fleet_run import RunOutcome
 from sim_bridge.world.sim_table import sim_table
@@ -61,6 +63,7 @@ def report_figures(
             }
             | _of_counters(lives)
         )
+    names = {target.id: target.name for target in config.targets}
     return {
         "config": effective(config),
         "mode": mode,
@@ -68,6 +71,10 @@ def report_figures(
         "duration_s": results.duration_s,
         "truth": "simulator",
         "agents": agents,
+        "targets": [
+            {"id": track.target_id, "name": names.get(track.target_id, "")} | track.figures()
+            for track in results.targets
+        ],
         "fleet": _of_fleet(results, agents)
         | {
             "wall_s": outcome.wall_s,
@@ -257,3 +264,5 @@ def _print(figures: dict[str, Any]) -> None:
         for row in (*figures["agents"], figures["fleet"])
     ]
     print_table(columns, rows)
+    if figures["targets"]:
+        print_table([title for title, _ in TARGET_COLUMNS], [target_cells(row) for row in figures["targets"]])

@@ -20,6 +20,7 @@ from agent.log.estimate_log import covariance_of, entry_dtype, read_entries, var
 from estimators.estimator import Status
 from estimators.integrity.consistency import nees
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
+from fleetloc.report.target_results import TargetTrack, target_tracks
 from fleetloc.run import run_files
 from sim_bridge.world.truth import Truth, load_truth
 
@@ -82,13 +83,14 @@ class AgentTrack:
 
 @dataclass(frozen=True, slots=True)
 class FleetResults:
-    """A run against its truth."""
+    """A run against its truth; of ``targets`` one track per target and drone."""
 
     truth: Truth
     start_unix_s: float
     duration_s: float
     period_s: float
     tracks: tuple[AgentTrack, ...]
+    targets: tuple[TargetTrack, ...] = ()
 
 
 def load_results(config: FleetConfig, directory: Path) -> FleetResults:
@@ -96,7 +98,8 @@ def load_results(config: FleetConfig, directory: Path) -> FleetResults:
     truth = load_truth(directory / run_files.TRUTH)
     start_unix_s, end_unix_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
     tracks = tuple(_track(config, directory, agent_id, truth) for agent_id in config.ids)
-    return FleetResults(truth, start_unix_s, end_unix_s - start_unix_s, config.fleet.period_s, tracks)
+    targets = target_tracks(config, directory, truth, {track.agent_id: track.ticks_expected for track in tracks})
+    return FleetResults(truth, start_unix_s, end_unix_s - start_unix_s, config.fleet.period_s, tracks, targets)
 
 
 def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) -> AgentTrack:
@@ -110,7 +113,7 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     entries = entries[inside]
     own = position(Layout(config.ids).slot(agent_id))
     when = np.clip(epoch_s + entries["t_s"], truth.time_unix_s[0], truth.time_unix_s[-1])
-    error = _error(entries, truth, when)
+    error = _error(entries, truth, when, len(config.ids))
     absent = np.repeat(is_absent(entries["age_ticks"][:, : len(config.ids)]), STATES_PER_AGENT, axis=1)
     error[absent] = 0.0  # nothing is said of them
     known = np.asarray(entries["status"] != Status.NO_DATA)
@@ -149,15 +152,15 @@ def _served(
     begun = newest >= 0
     newest, of_tick = newest[begun], ticks[begun]
     when = np.clip(config.fleet.epoch_unix_s + of_tick * period_s, truth.time_unix_s[0], truth.time_unix_s[-1])
-    error = _error(estimates[newest], truth, when)
+    error = _error(estimates[newest], truth, when, len(config.ids))
     absent = is_absent(estimates["age_ticks"][newest][:, : len(config.ids)])
     error[np.repeat(absent, STATES_PER_AGENT, axis=1)] = 0.0
     return ServedTicks(time_s, time_s[begun], error[:, own], error, own_ticks[newest] == of_tick)
 
 
-def _error(entries: NDArray[np.void], truth: Truth, when: Floats) -> Floats:
-    """Of the drones' states ``(T, 6n)``; targets stand behind them, and the truth does not know them."""
-    known = truth.at(when)
+def _error(entries: NDArray[np.void], truth: Truth, when: Floats, drones: int) -> Floats:
+    """Of the drones' states ``(T, 6n)``; targets stand behind them."""
+    known = truth.at(when)[:, :drones]
     known = known.reshape(len(entries), math.prod(known.shape[1:]))  # -1 would not do for a drone without ticks
     return np.asarray(entries["mean"][:, : known.shape[1]] - known, np.float64)
 

@@ -60,13 +60,13 @@ def export(
     with ExitStack() as files:
         fleet = config.fleet
         mcap = files.enter_context(
-            closing(EstimateMcap(directory / MCAP, config.ids, fleet.period_s, fleet.epoch_unix_s))
+            closing(EstimateMcap(directory / MCAP, config.bodies, fleet.period_s, fleet.epoch_unix_s))
         )
         tables = {}
         for agent_id in agents:
             path = run_files.record_path(directory, agent_id).with_suffix(TABLE_SUFFIX)
-            tables[agent_id] = files.enter_context(closing(CsvWriter(path, config.ids, epoch_unix_s, start_s)))
-        streams = [_located_entries(directory, Layout(config.ids), agent_id) for agent_id in agents]
+            tables[agent_id] = files.enter_context(closing(CsvWriter(path, config.bodies, epoch_unix_s, start_s)))
+        streams = [_located_entries(directory, Layout(config.bodies), agent_id) for agent_id in agents]
         for published_s, agent_id, entry in heapq.merge(*streams, key=itemgetter(0)):
             ready = _ready(entry, config, published_s)
             tables[agent_id].write(ready)
@@ -85,7 +85,7 @@ def _ready(entry: np.void, config: FleetConfig, published_s: float) -> EstimateR
     estimate = Estimate(
         tick=int(entry["tick"]),
         mean=entry["mean"],
-        covariance=covariance_of(entry, len(config.ids)),
+        covariance=covariance_of(entry, len(config.bodies)),
         status=Status(int(entry["status"])),
         age_ticks=entry["age_ticks"],
     )

@@ -13,6 +13,8 @@ from agent.config.tables import FleetConfig
 from fleetloc.extras import is_installed, sentence
 from fleetloc.report.fleet_results import FleetResults
 from fleetloc.report.style import NO_PLOTS
+from fleetloc.report.target_results import COLUMNS as TARGET_COLUMNS
+from fleetloc.report.target_results import target_cells
 from sim_bridge.world.sim_table import sim_table
 
 CSS = """
@@ -50,8 +52,8 @@ def page(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) ->
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
         f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
-        f'<p class="note">{escape(_summary(config, figures))}</p>\n{_warnings(fleet)}{_table(figures)}\n{body}\n'
-        "</body>\n</html>\n"
+        f'<p class="note">{escape(_summary(config, figures))}</p>\n{_warnings(fleet)}'
+        f"{_table(figures)}{_targets(figures)}\n{body}\n</body>\n</html>\n"
     )
 
 
@@ -67,6 +69,8 @@ def _drawn(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) 
         ("Position error and its 3-sigma band",
          "Each drone's error of its own position; the shaded band is what it claims. Grey: its GPS is out.",
          report_plots.errors(config, results)),
+        *([("Targets", "Error of each target's position as each drone had it; pale: the 3 sigma that it claimed.",
+            report_plots.targets(results))] if results.targets else []),
         ("Consistency", "Squared error of the whole fleet state in units of its covariance: near 1 is right, above "
          "the band the estimator is overconfident, below it is cautious. Samples of one run are correlated.",
          report_plots.consistency(results)),
@@ -106,6 +110,15 @@ def _table(figures: dict[str, Any]) -> str:
     rows = [_row(f"drone {agent['id']}", agent) for agent in figures["agents"]]
     rows.append(_row("fleet", figures["fleet"], ' class="total"'))
     return f"<table>\n<tr><th></th>{head}</tr>\n{''.join(rows)}</table>"
+
+
+def _targets(figures: dict[str, Any]) -> str:
+    """What each drone knew of each target."""
+    if not figures["targets"]:
+        return ""
+    head = "".join(f"<th>{escape(title)}</th>" for title, _ in TARGET_COLUMNS)
+    rows = ("".join(f"<td>{escape(cell)}</td>" for cell in target_cells(row)) for row in figures["targets"])
+    return f"\n<h2>Targets</h2>\n<table>\n<tr>{head}</tr>\n{''.join(f'<tr>{row}</tr>' for row in rows)}</table>"
 
 
 def _row(name: str, row: dict[str, Any], mark: str = "") -> str:

@@ -27,6 +27,7 @@ BAND = "95 % of a consistent estimator's samples"
 GAPS = 1.5
 """Ticks further apart than this many periods are not joined by a line."""
 SETTLING_S = 5.0
+TARGET_COLOUR = "#444444"
 AXES = ("north", "east", "down")
 
 
@@ -58,6 +59,15 @@ def trajectories(config: FleetConfig, results: FleetResults) -> Figure:
         when, north, east, down = _columns(track, results, track.own_m)
         above.plot(east, north, color=colour(slot), linewidth=0.9, label=f"drone {track.agent_id}")
         beside.plot(when, -down, color=colour(slot), linewidth=0.9)
+    for target_id in dict.fromkeys(track.target_id for track in results.targets):
+        truth_m = results.truth.position_m[:, results.truth.agents.index(target_id)]
+        above.plot(truth_m[:, 1], truth_m[:, 0], color=TARGET_COLOUR, alpha=0.3, linewidth=4)
+        beside.plot(time_s, -truth_m[:, 2], color=TARGET_COLOUR, alpha=0.3, linewidth=4)
+    for seen in results.targets[:: len(results.tracks)]:  # as the first drone has it
+        label = f"target {seen.target_id} by {seen.agent_id}"
+        when, north, east, down = unbroken(seen.time_s, *seen.position_m.T, gap_s=GAPS * results.period_s)
+        above.plot(east, north, color=TARGET_COLOUR, linewidth=0.9, label=label)
+        beside.plot(when, -down, color=TARGET_COLOUR, linewidth=0.9)
     places_m = np.array(list(config.places_m.values())).reshape(-1, 3)
     if len(places_m):
         above.plot(places_m[:, 1], places_m[:, 0], "k^", markersize=5, label="anchors")
@@ -92,6 +102,27 @@ def errors(config: FleetConfig, results: FleetResults) -> Figure:
         axes.set_title(name)
     for axes in grid[-1]:
         axes.set_xlabel("time s")
+    return figure
+
+
+@styled
+def targets(results: FleetResults) -> Figure:
+    """Error of each target as each drone had it, over its 3 sigma, a row per target; logarithmic."""
+    ids = list(dict.fromkeys(track.target_id for track in results.targets))
+    figure = figure_of(0.6 + 2.4 * len(ids))
+    grid = figure.subplots(len(ids), 1, sharex=True, squeeze=False)[:, 0]
+    for axes, target_id in zip(grid, ids, strict=True):
+        seen = [track for track in results.targets if track.target_id == target_id]
+        for slot, track in enumerate(seen):
+            error_m, sigma_m = (np.linalg.norm(each, axis=1) for each in (track.error_m, track.sigma_m))
+            when, error, band = unbroken(track.time_s, error_m, 3 * sigma_m, gap_s=GAPS * results.period_s)
+            axes.plot(when, band, color=colour(slot), alpha=0.3, linewidth=3)
+            axes.plot(when, error, color=colour(slot), linewidth=0.8, label=f"drone {track.agent_id}")
+        axes.set(yscale="log", xlim=(0, results.duration_s), ylabel=f"target {target_id}\nm")
+        plain_log(axes)
+    grid[-1].set_xlabel("time s")
+    handles, labels = grid[0].get_legend_handles_labels()
+    figure.legend(handles, labels, loc="outside lower center", ncols=6)
     return figure
 
 

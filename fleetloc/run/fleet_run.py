@@ -10,13 +10,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from rich.console import Console
+from rich.console import Console, Group
 from rich.live import Live
 
 from agent.config.tables import FleetConfig
 from agent.exit_codes import ExitCode
 from fleetloc.errors import BAD_INPUT, REFUSED, FleetlocError
-from fleetloc.run import live_table, run_files
+from fleetloc.run import live_table, live_targets, run_files
 from fleetloc.run.fleet_observer import RunObserver
 from fleetloc.run.live_truth import LiveTruth
 from fleetloc.run.processes import Child, cpu_time_s, resident_mb, stop_all
@@ -251,15 +251,21 @@ class FleetRun:
         title = f"{self._config.fleet.name}: {self._flown_s:.0f} of {sim_table(self._config).duration_s:.0f} s"
         return title, live_table.rows(self._config, self._observer, self._truth, ended, time.monotonic())
 
+    def _targets(self) -> list[live_targets.TargetRow]:
+        return live_targets.target_rows(self._config, self._observer, self._truth, time.monotonic())
+
     async def _show(self) -> None:
         if not self._console.is_terminal:
             while True:
                 await asyncio.sleep(LINE_PERIOD_S)
-                for line in live_table.lines(*self._picture()):
+                for line in (*live_table.lines(*self._picture()), *live_targets.lines(self._targets())):
                     self._console.print(line, markup=False, highlight=False, soft_wrap=True)
         with Live(console=self._console, auto_refresh=False) as live:
             while True:
-                live.update(live_table.table(*self._picture()), refresh=True)
+                shown = [live_table.table(*self._picture())]
+                if self._config.targets:
+                    shown.append(live_targets.table(self._targets()))
+                live.update(Group(*shown), refresh=True)
                 await asyncio.sleep(REFRESH_S)
 
     # --- end ------------------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 """The simulator's truth while it flies, as lines on a pipe to the process that started it.
 
 No agent can see the pipe; the live picture compares estimates with it. One line of JSON per sample:
-``{"time_unix_s": ..., "position_m": [[n, e, d], ...]}`` in the order of the fleet's agents.
+``{"time_unix_s": ..., "position_m": [[n, e, d], ...]}`` in the order of the fleet's agents, then
+its targets.
 """
 
 from __future__ import annotations
@@ -19,7 +20,7 @@ KEPT = 300
 
 
 class TruePlaces(msgspec.Struct, frozen=True):
-    """Where every agent truly was, NED metres."""
+    """Where every body truly was, NED metres."""
 
     time_unix_s: float
     position_m: tuple[tuple[float, float, float], ...]
@@ -36,7 +37,7 @@ class TruthWriter:
         if simulation.now < self._next_s:
             return
         self._next_s = simulation.now + PERIOD_S
-        positions = tuple((float(n), float(e), float(d)) for n, e, d in simulation.world.position_m)
+        positions = tuple((float(n), float(e), float(d)) for n, e, d in simulation.bodies()[0])
         sample = TruePlaces(simulation.now + simulation.unix_offset_s, positions)
         sys.stdout.buffer.write(msgspec.json.encode(sample) + b"\n")
         sys.stdout.buffer.flush()

@@ -250,7 +250,7 @@ class FleetLockstep:
 
     def _on_ranges(self, measured: SensedRanges, taken_s: float) -> None:
         drone = self.fleet.drones.get(measured.observer)
-        there = self.fleet.drones.keys() | self._config.places_m.keys()
+        there = self.fleet.drones.keys() | self._config.places_m.keys() | self._config.kinds.keys()
         heard = tuple(each for each in measured.ranges if each.target in there)
         if drone is None or (measured.ranges and not heard):
             return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -91,11 +92,35 @@ class FigureEight:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Line:
+    """Straight on at constant velocity, swinging about the line: ``swing_m`` out on each axis, in ``swing_s``."""
+
+    start_m: Point
+    velocity_mps: Point
+    swing_m: Point = (0.0, 0.0, 0.0)
+    swing_s: float = 60.0
+
+    def reference(self, time_s: float) -> Reference:
+        """The point reached and its derivatives."""
+        rate = 2.0 * math.pi / self.swing_s
+        out, along = math.sin(rate * time_s), math.cos(rate * time_s)
+        swings = list(zip(self.start_m, self.velocity_mps, self.swing_m, strict=True))
+        north, east, down = (p + time_s * v + out * a for p, v, a in swings)
+        v_north, v_east, v_down = (v + rate * along * a for _, v, a in swings)
+        a_north, a_east, a_down = (-rate * rate * out * a for a in self.swing_m)
+        return Reference((north, east, down), (v_north, v_east, v_down), (a_north, a_east, a_down))
+
+
 def peak_accel_mps2(path: Path) -> float:
     """Largest acceleration per axis that following a path needs (steps between waypoints not counted)."""
-    if not isinstance(path, Circle | FigureEight):
+    if isinstance(path, Circle | FigureEight):
+        lap_s = path.lap_s
+    elif isinstance(path, Line):
+        lap_s = path.swing_s
+    else:
         return 0.0
-    lap = (path.reference(path.lap_s * part / 64.0).accel_mps2 for part in range(64))
+    lap = (path.reference(lap_s * part / 64.0).accel_mps2 for part in range(64))
     return max(abs(axis) for accel in lap for axis in accel)
 
 
@@ -119,6 +144,18 @@ def default_path(slot: int, fleet_size: int) -> Waypoints:
         return Waypoints((STUDIES_REFERENCES_M[slot],))
     angle = 2.0 * math.pi * slot / fleet_size
     return Waypoints(((10.0 * math.cos(angle), 10.0 * math.sin(angle), 5.0),))
+
+
+def standing(slot: int) -> Waypoints:
+    """What a target without a path of its own does: stand on the ground, 10 m north of the one before it."""
+    return Waypoints(((10.0 * slot, 0.0, 0.0),))
+
+
+def moved_along(paths: Sequence[Path], time_s: float) -> tuple[Array, Array]:
+    """Positions and velocities ``(m, 3)`` NED of bodies that are exactly where their paths are."""
+    references = [path.reference(time_s) for path in paths]
+    places = np.array([reference.position_m for reference in references], float).reshape(-1, 3)
+    return places, np.array([reference.velocity_mps for reference in references], float).reshape(-1, 3)
 
 
 def lqr_gain(period_s: float, state_weight: float = 1.0, input_weight: float = 1.0) -> Array:

@@ -79,6 +79,8 @@ class Scenario:
     edges: tuple[tuple[int, int], ...] | None = None
     anchors: tuple[tuple[int, Point], ...] = ()
     """Ids and places, NED, of modules that all vehicles range."""
+    targets: tuple[tuple[int, Path], ...] = ()
+    """Ids and paths of bodies that all vehicles range and that are no part of the fleet."""
     gravity_mps2: float | None = None
     """Absent: normal gravity at the origin."""
     imu_hz: float = 100.0

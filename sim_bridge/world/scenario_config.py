@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from agent.config.tables import AgentTable, FleetConfig
 from agent.sensing.frames import FleetFrame, gravity_mps2
-from sim_bridge.world.guidance import Circle, FigureEight, Path, Waypoints
+from sim_bridge.world.guidance import Circle, FigureEight, Line, Path, Waypoints, standing
 from sim_bridge.world.noise import FlavourName
 from sim_bridge.world.scenario import Interval, Scenario, Vehicle
-from sim_bridge.world.sim_table import CirclePath, FigureEightPath, PathTable, WaypointsPath, sim_table
+from sim_bridge.world.sim_table import CirclePath, FigureEightPath, LinePath, PathTable, WaypointsPath, sim_table
 
 
 def scenario_from_config(config: FleetConfig) -> Scenario:
@@ -27,6 +27,7 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         epoch_unix_s=config.fleet.epoch_unix_s,
         edges=config.fleet.edges,
         anchors=tuple(config.places_m.items()),
+        targets=tuple((t.id, paths.get(t.id) or standing(slot)) for slot, t in enumerate(config.targets)),
         gravity_mps2=gravity_mps2(config),
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,
@@ -58,5 +59,7 @@ def _path(table: PathTable) -> Path:
             return Waypoints(table.points_m, table.hold_s, table.repeat)
         case CirclePath():
             return Circle(table.center_m, table.radius_m, table.lap_s, table.phase_rad)
+        case LinePath():
+            return Line(table.start_m, table.velocity_mps, table.swing_m, table.swing_s)
         case FigureEightPath():
             return FigureEight(table.center_m, table.length_m, table.width_m, table.lap_s, table.phase_rad)

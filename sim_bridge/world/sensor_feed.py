@@ -63,7 +63,8 @@ class SensorFeed:
         self._aided_until_s: list[float | None] = [None for _ in scenario.ids]
         """World time; nothing before the first fix."""
         self._truth_every = max(round(1.0 / (scenario.truth_hz * step_s)), 1)
-        self._recorder = TruthRecorder(scenario.ids, simulation.sensors.pair_bias_m)
+        bodies = (*scenario.ids, *(target for target, _ in scenario.targets))
+        self._recorder = TruthRecorder(bodies, simulation.sensors.pair_bias_m)
         self._record()
 
     def step(self) -> Sensed:
@@ -105,4 +106,4 @@ class SensorFeed:
     def _record(self) -> None:
         simulation, world = self._simulation, self._simulation.world
         time_unix_s = simulation.start_s + world.time_s + simulation.unix_offset_s
-        self._recorder.record(time_unix_s, world.position_m, world.velocity_mps)
+        self._recorder.record(time_unix_s, *simulation.bodies())

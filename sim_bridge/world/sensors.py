@@ -13,6 +13,7 @@ import numpy as np
 
 from sim_bridge.faults.sensor_faults import NO_ERROR, RangeError, SensorFaults
 from sim_bridge.world import geodesy, quaternions
+from sim_bridge.world.guidance import moved_along
 from sim_bridge.world.noise import PROFILES, AttitudeNoise, GaussMarkov, GpsNoise, ImuNoise, UwbNoise, uncalibrated
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
@@ -202,12 +203,13 @@ class _Channel:
     """Errors of the ranges between the agents."""
 
     def __init__(
-        self, noise: UwbNoise, ids: tuple[int, ...], seeds: np.random.SeedSequence, anchors: tuple[int, ...]
+        self, noise: UwbNoise, ids: tuple[int, ...], seeds: np.random.SeedSequence, others: tuple[int, ...]
     ) -> None:
+        """``others`` are the ids of anchors and targets."""
         self._noise = noise
         own, *per_agent = seeds.spawn(1 + len(ids))
         fixed = np.random.default_rng(seeds.spawn(1)[0])
-        self._anchor_bias_m = {(agent, anchor): self._drawn_bias_m(fixed) for agent in ids for anchor in anchors}
+        self._bias_to_others_m = {(agent, other): self._drawn_bias_m(fixed) for agent in ids for other in others}
         rng = np.random.default_rng(own)
         self._rngs = {agent: np.random.default_rng(seed) for agent, seed in zip(ids, per_agent, strict=True)}
         self.bias_m = {
@@ -232,8 +234,8 @@ class _Channel:
         blocked = float(rng.random()) < noise.nlos_probability
         detour = min(float(rng.exponential(noise.nlos_mean_m)), noise.nlos_max_m)
         lobe = noise.orientation_m * math.sin(bearing_rad + self._phase_rad[observer])
-        anchored = self._anchor_bias_m.get((observer, target))
-        bias = self.bias_m[frozenset((observer, target))] if anchored is None else anchored
+        to_other = self._bias_to_others_m.get((observer, target))
+        bias = self.bias_m[frozenset((observer, target))] if to_other is None else to_other
         error = uniform + white + bias + lobe + (detour if blocked else 0.0) + fault.extra_m
         blocked = blocked or fault.blocked
         rx_dbm = -60.0 - 20.0 * math.log10(max(true_m, 1.0)) - (6.0 if blocked else 0.0)
@@ -287,7 +289,8 @@ class FleetSensors:
         self._gps_grid = _Grid(scenario.gps_hz)
         self._undelivered: deque[tuple[float, int, GpsFix]] = deque()
         uwb = profile.uwb if scenario.uwb_calibrated else uncalibrated(profile.uwb)
-        self._channel = _Channel(uwb, scenario.ids, kinds[4], tuple(anchor for anchor, _ in scenario.anchors))
+        others = tuple(body for body, _ in (*scenario.anchors, *scenario.targets))
+        self._channel = _Channel(uwb, scenario.ids, kinds[4], others)
         cycle_s = 1.0 / scenario.uwb_hz
         self._uwb_grids = [
             _Grid(scenario.uwb_hz, cycle_s * slot / count if scenario.uwb_staggered else 0.0) for slot in range(count)
@@ -432,12 +435,19 @@ class FleetSensors:
             taken = self._range(slot, target, between)
             if taken is not None:
                 measured.append(replace(taken, tag=tag, other_tag=other_tag))
-        for anchor, place_m in self._scenario.anchors:
-            tag, _ = self._turn(slot, -anchor)
-            taken = self._range(slot, anchor, np.array(place_m) - self._tag_position(slot, tag))
+        for other, place_m in self._places_of_others():
+            tag, _ = self._turn(slot, -other)
+            taken = self._range(slot, other, place_m - self._tag_position(slot, tag))
             if taken is not None:
                 measured.append(replace(taken, tag=tag))
         return measured
+
+    def _places_of_others(self) -> list[tuple[int, Array]]:
+        """Ids and places ``(3,)`` NED of the anchors and, now, of the targets."""
+        scenario = self._scenario
+        places_m, _ = moved_along([path for _, path in scenario.targets], self._world.time_s)
+        still = [(anchor, np.array(place_m)) for anchor, place_m in scenario.anchors]
+        return still + list(zip((target for target, _ in scenario.targets), places_m, strict=True))
 
     def _range(self, slot: int, target: int, between: Array) -> SensedRange | None:
         """What a vehicle's module measures of a body that is ``between`` ``(3,)`` NED away, if it is in reach."""
@@ -451,7 +461,7 @@ class FleetSensors:
         return self._channel.measure(observer, target, distance_m, bearing_rad, fault)
 
     def _turn(self, slot: int, there: int) -> tuple[int, int]:
-        """Between which antennas the next range is; anchors, in place of a slot their negative id, have one."""
+        """Between which antennas the next range is; other bodies, in place of a slot their negative id, have one."""
         turn, own = self._exchanges[slot, there], len(self._tags[slot])
         self._exchanges[slot, there] += 1
         return turn % own, turn // own % (len(self._tags[there]) if there >= 0 else 1)

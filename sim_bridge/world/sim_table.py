@@ -30,7 +30,7 @@ class WaypointsPath(Table, frozen=True, tag_field="kind", tag="waypoints"):
     """Fly to the points in turn, each held for a while."""
 
     agent: AgentId
-    """Who flies it."""
+    """Who flies it: a drone, or a target of ``[[targets]]``."""
     points_m: Annotated[tuple[Point, ...], msgspec.Meta(min_length=1)]
     """NED, the first one the start."""
     hold_s: Positive = 10.0
@@ -43,7 +43,7 @@ class CirclePath(Table, frozen=True, tag_field="kind", tag="circle"):
     """A horizontal circle, right-handed about down (clockwise from above)."""
 
     agent: AgentId
-    """Who flies it."""
+    """Likewise."""
     center_m: Point
     """NED."""
     radius_m: Positive = 5.0
@@ -58,7 +58,7 @@ class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
     """A horizontal Lissajous eight: north at the lap's frequency, east at twice that."""
 
     agent: AgentId
-    """Who flies it."""
+    """Likewise."""
     center_m: Point
     """NED, where the eight crosses itself."""
     length_m: Positive = 10.0
@@ -71,7 +71,22 @@ class FigureEightPath(Table, frozen=True, tag_field="kind", tag="figure_eight"):
     """Where on it the flight starts."""
 
 
-PathTable = WaypointsPath | CirclePath | FigureEightPath
+class LinePath(Table, frozen=True, tag_field="kind", tag="line"):
+    """Straight on at constant velocity, or swinging about such a line."""
+
+    agent: AgentId
+    """Likewise."""
+    start_m: Point
+    """NED, where the flight begins."""
+    velocity_mps: Point
+    """NED, along the line."""
+    swing_m: Point = (0.0, 0.0, 0.0)
+    """How far out it swings on each axis, NED."""
+    swing_s: Positive = 60.0
+    """Time of one swing to both sides."""
+
+
+PathTable = WaypointsPath | CirclePath | FigureEightPath | LinePath
 
 
 class SimTable(Table, frozen=True):
@@ -100,7 +115,7 @@ class SimTable(Table, frozen=True):
     faults: tuple[FaultTable, ...] = ()
     """What goes wrong with which drones when."""
     paths: tuple[PathTable, ...] = ()
-    """One per agent."""
+    """One per drone or target. A drone without one hovers; a target without one stands still on the ground."""
 
 
 def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
@@ -112,12 +127,21 @@ def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
     yield from wrong_settings(table.faults, config, "sim.faults")
     if table.uwb_module != "none" and any(len(agent.uwb_tags_m) > 1 for agent in config.agents):
         yield Fault("sim.uwb_module", '"none" where a drone has several UWB tags', f'"{table.uwb_module}"')
+    yield from _paths(table, config)
+
+
+def _paths(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
+    """One per body; a target, which nothing accelerates, cannot leap between waypoints."""
+    targets = {target.id for target in config.targets}
     flown: set[int] = set()
     for index, path in enumerate(table.paths):
-        key = f"sim.paths[{index}].agent"
-        yield from unknown_ids(config, key, (path.agent,))
+        key = f"sim.paths[{index}]"
+        if path.agent not in targets:
+            yield from unknown_ids(config, f"{key}.agent", (path.agent,))
+        elif isinstance(path, WaypointsPath) and len(path.points_m) > 1:
+            yield Fault(f"{key}.points_m", "one point, where the target stands, or another kind of path", "several")
         if path.agent in flown:
-            yield Fault(key, "one path per agent", f"a second path of agent {path.agent}")
+            yield Fault(f"{key}.agent", "one path per drone or target", f"a second path of {path.agent}")
         flown.add(path.agent)
 
 

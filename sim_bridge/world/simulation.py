@@ -18,7 +18,7 @@ from sim_bridge.autopilot.fake_autopilot import AutopilotSetup, FakeAutopilot
 from sim_bridge.autopilot.link_faults import FaultyLink
 from sim_bridge.autopilot.truth_messages import TrueState
 from sim_bridge.world import quaternions
-from sim_bridge.world.guidance import Waypoints, default_path
+from sim_bridge.world.guidance import Waypoints, default_path, moved_along
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Reboot, Scenario
 from sim_bridge.world.sensors import FleetSensors, SensedAttitude, SensedImu, SensedRanges
@@ -136,7 +136,8 @@ class Simulation:
         links = np.random.SeedSequence((scenario.seed, 2)).spawn(2 * len(scenario.ids))
         self._down_links = self._links(links[::2])
         self._up_links = self._links(links[1::2])
-        self._recorder = TruthRecorder(scenario.ids, self.sensors.pair_bias_m)
+        bodies = (*scenario.ids, *(target for target, _ in scenario.targets))
+        self._recorder = TruthRecorder(bodies, self.sensors.pair_bias_m)
         self._truth_every = max(round(1.0 / (scenario.truth_hz * self.world.step_s)), 1)
         self._reboots: deque[Reboot] = deque(sorted(scenario.reboots, key=lambda reboot: reboot.at_s))
         self._record()
@@ -229,8 +230,12 @@ class Simulation:
         return [frame for _, frame in sent]
 
     def _record(self) -> None:
-        world = self.world
-        self._recorder.record(self.now + self.unix_offset_s, world.position_m, world.velocity_mps)
+        self._recorder.record(self.now + self.unix_offset_s, *self.bodies())
+
+    def bodies(self) -> tuple[Array, Array]:
+        """Positions and velocities ``(n + m, 3)`` NED of vehicles, then targets."""
+        world, targets = self.world, moved_along([path for _, path in self.scenario.targets], self.world.time_s)
+        return np.vstack((world.position_m, targets[0])), np.vstack((world.velocity_mps, targets[1]))
 
     def truth(self) -> Truth:
         """What happened so far, for the report only."""

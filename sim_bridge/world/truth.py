@@ -23,8 +23,8 @@ class TruthError(ValueError):
 class Truth:
     """Sampled truth of a fleet, NED metres and m/s.
 
-    ``time_unix_s`` ``(K,)`` rising, ``agents`` ids, ``position_m`` and ``velocity_mps`` ``(K, n, 3)``,
-    ``pairs`` ``(m, 2)`` ids with the bias of their ranges ``pair_bias_m`` ``(m,)``.
+    ``time_unix_s`` ``(K,)`` rising, ``agents`` ids, those of targets behind those of drones, ``position_m`` and
+    ``velocity_mps`` ``(K, n, 3)``, ``pairs`` ``(m, 2)`` ids with the bias of their ranges ``pair_bias_m`` ``(m,)``.
     """
 
     time_unix_s: Array

@@ -62,6 +62,7 @@ function showWords() {
   byId("alarm-count").textContent = shown.length ? `(${shown.length})` : "";
   showAlarms();
   showDrones();
+  showTargets();
   showLinks();
   const refused = Object.entries(picture.refused).map(([reason, count]) => `${reason} ${count}`);
   byId("refused").textContent = refused.length ? `Packets that this monitor refused: ${refused.join(", ")}` : "";
@@ -114,6 +115,25 @@ function showDrones() {
   byId("drones").tBodies[0].replaceChildren(...rows);
 }
 
+function showTargets() {
+  byId("targets-part").hidden = !picture.targets.length;
+  const rows = picture.targets.map((target) => {
+    const row = document.createElement("tr");
+    row.dataset.target = target.target_id;
+    cell(row, `${target.target_id} ${target.name}`.trim());
+    const place = target.seen_by ? target.seen_by.position_m : null, speed = target.velocity_mps;
+    cell(row, place ? number(place[0], 1) : "–");
+    cell(row, place ? number(place[1], 1) : "–");
+    cell(row, place ? number(-place[2], 1) : "–");
+    cell(row, target.ellipse ? `${short(target.ellipse.major_m)} / ${short(target.ellipse.up_m)}` : "–");
+    cell(row, speed ? number(Math.hypot(speed[0], speed[1]), 1) : "–");
+    cell(row, target.seen_by ? number(target.seen_by.age_s, 1) : "–");
+    cell(row, target.seen_by ? target.seen_by.agent_id : "nobody");
+    return row;
+  });
+  byId("targets").tBodies[0].replaceChildren(...rows);
+}
+
 function showLinks() {
   const rows = picture.links.map((link) => {
     const row = document.createElement("tr");
@@ -141,9 +161,14 @@ function placed() {
   return picture.drones.filter((drone) => drone.position_m);
 }
 
+function sighted() {
+  return picture.targets.filter((target) => target.seen_by && target.ellipse);
+}
+
 function spots() {  // what the view has to hold: [north, east, reach]; uncertainties as far as they are not absurd
   const fixed = Object.values(picture.anchors).map(([north, east]) => [north, east, 0]);
-  return fixed.concat(placed().flatMap((drone) => {
+  const aims = sighted().map((target) => [...target.seen_by.position_m.slice(0, 2), Math.min(target.ellipse.major_m, 30)]);
+  return fixed.concat(aims, placed().flatMap((drone) => {
     const own = [...drone.position_m.slice(0, 2), Math.min(drone.ellipse ? drone.ellipse.major_m : 0, 30)];
     if (!isGone(drone) || !drone.seen_by) return [own];
     return [own, [...drone.seen_by.position_m.slice(0, 2), Math.min(3 * drone.seen_by.sigma_m, 5)]];
@@ -191,6 +216,7 @@ function drawTop() {
     svg(layer, "path", { class: "anchor", d: `M ${at.x} ${at.y - 7} l 7 12 l -14 0 Z`, fill: "currentColor" });
     svg(layer, "text", { class: "label", x: at.x + 10, y: at.y + 5 }, id);
   }
+  for (const target of sighted()) targetFromAbove(layer, target, x, y);
   for (const drone of placed()) fromAbove(layer, drone, colours.get(drone.agent_id), x, y);
   map.replaceChildren(layer);
 }
@@ -264,12 +290,26 @@ function fromAbove(layer, drone, colour, x, y) {
   svg(group, "text", { class: `label ${drone.level}`, x: at.x + 12, y: at.y - 12 }, words);
 }
 
+function targetFromAbove(layer, target, x, y) {
+  const group = svg(layer, "g", { class: "target", "data-target": target.target_id });
+  const [north, east] = target.seen_by.position_m, { major_m, minor_m, angle_rad } = target.ellipse;
+  const at = { x: x(east), y: y(north) }, vast = major_m * view.scale > byId("top").clientWidth;
+  svg(group, "ellipse", { class: vast ? "ellipse vast" : "ellipse", cx: at.x, cy: at.y, rx: minor_m * view.scale, ry: major_m * view.scale,
+    fill: "currentColor", stroke: "currentColor", transform: `rotate(${angle_rad * 180 / Math.PI} ${at.x} ${at.y})` });
+  const [vn, ve] = target.velocity_mps;
+  svg(group, "line", { class: "speed", stroke: "currentColor", x1: at.x, y1: at.y, x2: at.x + ve * view.scale, y2: at.y - vn * view.scale });
+  svg(group, "path", { d: `M ${at.x - 7} ${at.y} l 7 -7 l 7 7 l -7 7 Z`, fill: "currentColor" });
+  svg(group, "text", { class: "label", x: at.x + 12, y: at.y - 8 }, `${target.target_id} ${target.name}`.trim());
+}
+
 function drawSide() {
   const map = byId("side");
   const { width, height } = map.getBoundingClientRect();
   if (!width || !height || !view) return;
-  const drones = placed();
-  const [low, high] = extent(drones.map((d) => -d.position_m[2]), drones.map((d) => Math.min(d.ellipse ? d.ellipse.up_m : 0, 30)));
+  const drones = placed(), aims = sighted();
+  const ups = [...drones.map((d) => -d.position_m[2]), ...aims.map((t) => -t.seen_by.position_m[2])];
+  const reach = [...drones, ...aims].map((body) => Math.min(body.ellipse ? body.ellipse.up_m : 0, 30));
+  const [low, high] = extent(ups, reach);
   const bottom = Math.min(low, 0), span = Math.max(high - bottom, 5) * 1.15;
   const top = Math.max(high, bottom + 5) + 0.07 * span;
   const x = (east) => width / 2 + (east - view.east) * view.scale;
@@ -279,6 +319,13 @@ function drawSide() {
   for (let up = Math.ceil(bottom / step) * step; up <= top; up += step) {
     svg(layer, "line", { class: Math.abs(up) < step / 2 ? "zero" : "grid", x1: 0, x2: width, y1: y(up), y2: y(up) });
     svg(layer, "text", { class: "axis", x: 3, y: y(up) - 3 }, `${+up.toFixed(3)} m`);
+  }
+  for (const target of aims) {
+    const at = { x: x(target.seen_by.position_m[1]), y: y(-target.seen_by.position_m[2]) };
+    const half = target.ellipse.up_m * (height - 26) / (top - bottom);
+    svg(layer, "line", { x1: at.x, x2: at.x, y1: at.y - half, y2: at.y + half, stroke: "currentColor", "stroke-width": 4, opacity: 0.5 });
+    svg(layer, "path", { d: `M ${at.x - 6} ${at.y} l 6 -6 l 6 6 l -6 6 Z`, fill: "currentColor" });
+    svg(layer, "text", { class: "label", x: at.x + 10, y: at.y - 7 }, `${target.target_id}`);
   }
   for (const drone of drones) {
     const colour = colourOf(drone.agent_id), at = { x: x(drone.position_m[1]), y: y(-drone.position_m[2]) };

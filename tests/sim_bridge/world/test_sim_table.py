@@ -42,7 +42,7 @@ def test_what_is_put_in_is_what_is_read() -> None:
         ("sim.paths.1.kind=loop", "sim.paths of agent 1, kind", "one of waypoints, circle, figure_eight", "'loop'"),
         ("sim.paths.1.points_m=[]", "sim.paths of agent 1, points_m", "one of kind, agent, center_m", "unknown"),
         ("sim.paths.1.center_m=[1,2]", "sim.paths of agent 1, center_m", "an array of length 3", "[1, 2]"),
-        ("sim.paths.1.agent=2", "sim.paths, entry 2, agent", "one path per agent", "a second path of agent 2"),
+        ("sim.paths.1.agent=2", "sim.paths, entry 2, agent", "one path per drone or target", "a second path of 2"),
         ("sim.paths.1.agent=8", "sim.paths of agent 8, agent", "ids of agents", "8"),
     ],
 )
@@ -64,3 +64,19 @@ def test_an_outage_must_end_after_it_begins() -> None:
     document["sim"]["gps_outages"] = [{"agent": 1, "from_s": 5.0, "to_s": 5.0}]
     with pytest.raises(ConfigError, match=r"sim.gps_outages of agent 1, to_s: expected later than from_s = 5"):
         sim_table(config_from(document, "here"))
+
+
+def test_a_target_has_a_path_like_a_drone_but_cannot_leap_between_waypoints() -> None:
+    document = tomllib.loads(LINE3.read_text()) | {"targets": [{"id": 101}]}
+    document["sim"]["paths"].append({"agent": 101, "kind": "line", "start_m": [0, 0, 0], "velocity_mps": [1, 0, 0]})
+    assert sim_table(config_from(document, "here")).paths[-1].agent == 101
+    document["sim"]["paths"][-1] = {"agent": 101, "kind": "waypoints", "points_m": [[0, 0, 0], [5, 0, 0]]}
+    with pytest.raises(ConfigError, match=r"points_m: expected one point, where the target stands"):
+        sim_table(config_from(document, "here"))
+
+
+def test_the_fleets_of_situational_awareness_fly_what_they_say() -> None:
+    configs = {path.stem: load_config(path) for path in (CONFIGS / "awareness").glob("*.toml")}
+    assert set(configs) == {"sparse_graph", "link_failures", "fixed_target", "moving_target"}
+    for config in configs.values():
+        assert {path.agent for path in sim_table(config).paths} == set(config.bodies)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from sim_bridge.world import quaternions
-from sim_bridge.world.guidance import Circle, FigureEight, Waypoints, lqr_gain, peak_accel_mps2
+from sim_bridge.world.guidance import Circle, FigureEight, Line, Waypoints, lqr_gain, peak_accel_mps2
 from sim_bridge.world.world import STEP_RATE_HZ, Dynamics, FleetWorld
 
 GRAVITY = 9.80665
@@ -19,6 +19,7 @@ paths = st.sampled_from(
         Waypoints(((3.0, -2.0, -5.0), (-4.0, 1.0, -8.0)), 2.0),
         Circle((0.0, 0.0, -5.0), 4.0, 12.0),
         FigureEight((1.0, 1.0, -5.0), 10.0, 5.0, 15.0),
+        Line((1.0, 1.0, -5.0), (0.5, 0.0, 0.0), (0.0, 3.0, 1.0), 20.0),
     ]
 )
 
@@ -106,7 +107,12 @@ def test_vehicles_settle_at_their_point_from_the_studies_starts(lag_s):
 
 
 @pytest.mark.parametrize(
-    "path", [Circle((1.0, 2.0, -5.0), 4.0, 12.0, 0.7), FigureEight((1.0, 2.0, -5.0), 10.0, 5.0, 15.0, 0.3)]
+    "path",
+    [
+        Circle((1.0, 2.0, -5.0), 4.0, 12.0, 0.7),
+        FigureEight((1.0, 2.0, -5.0), 10.0, 5.0, 15.0, 0.3),
+        Line((1.0, 2.0, -5.0), (2.0, -0.5, 0.1), (0.0, 6.0, 2.0), 30.0),
+    ],
 )
 def test_references_are_consistent_and_followed(path):
     # GIVEN a path, its velocity and acceleration are the derivatives of its position

@@ -445,6 +445,8 @@ class AgentCore:
         self.counters[f"integrity: {stated.state.lower()}"] += 1
         for off in stated.off:
             self.counters[f"integrity: fixes of {off} off"] += 1
+        for one, other in stated.ranges_off:
+            self.counters[f"integrity: ranges of {one} and {other} off"] += 1
         self.counters[f"status: {estimate.status.name.lower()}"] += 1
         self._end_tick()
 

@@ -12,9 +12,9 @@ class IntegrityTable(Table, frozen=True):
     """Largest horizontal error that whoever uses the position can do with; a protection level above is an alert."""
     alert_vertical_m: Positive = 6.0
     """The same of the height."""
-    exclude: bool = False
-    """Whether fixes of a receiver that is named as off never reach the estimator. Without, they are told of, and the
-    estimator weighs them by its own residuals."""
+    exclude: bool = True
+    """Whether fixes of a receiver, and ranges, that are named as off never reach the estimator. Without, they are
+    told of, and the estimator weighs them by its own residuals."""
     position_bound_m: Positive | None = None
     """Hard bound of a fix, north and east, for the guaranteed sets; absent = ``sensors.gps_position_half_width_m``,
     or none: then fixes say nothing for certain."""

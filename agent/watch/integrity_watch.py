@@ -18,12 +18,12 @@ from agent.watch.health import reason_of
 from estimators.estimator import Estimate
 from estimators.integrity.exclusion.baselines import SharedTick
 from estimators.integrity.exclusion.naming import NamingMonitor
-from estimators.integrity.finding import Finding
+from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.protection.levels import error_ellipse, protection_level, relative_covariance
 from estimators.integrity.protection.statement import AlertLimits, Guaranteed, Statement, judged, undetectable
 from estimators.integrity.sets.bank import BoundedTick, SensorBounds, SetBank
 from estimators.model.layout import position
-from estimators.model.measurements import Kind, RowTable
+from estimators.model.measurements import Kind, RowTable, Vector
 
 RECEIVER_KINDS = (Kind.POSITION, Kind.VELOCITY, Kind.SPEED)
 
@@ -40,16 +40,31 @@ class IntegrityWatch:
         self._bank = SetBank(period_s, bounds_of(table, config.estimator.limits.vehicle.speed_mps))
         self._taken: SharedTick | None = None
         self._named: tuple[Finding, ...] = ()
+        self._frozen = False
+        self._frozen_at: Vector | None = None
+        """``(3,)``: where the drone was when its receiver was first found frozen."""
         self.statement: Statement | None = None
 
     def take(self, tick: int, members: tuple[int, ...], rows: RowTable) -> RowTable:
-        """The rows of a tick, by slot of ``members``, less those of receivers that are off."""
+        """The rows of a tick, by slot of ``members``, less those of receivers and ranges that are off."""
         self._taken = SharedTick(tick, members, rows)
         self._named = self._naming.observe(self._taken)
-        if not (self._exclude and self._naming.named):
+        if not self._exclude:
             return rows
+        kept = np.ones(len(rows), np.bool_)
         off = [slot for slot, agent in enumerate(members) if agent in self._naming.named]
-        return rows[~(np.isin(rows["kind"], RECEIVER_KINDS) & np.isin(rows["agent"], off))]
+        if off:
+            kept &= ~(np.isin(rows["kind"], RECEIVER_KINDS) & np.isin(rows["agent"], off))
+        for pair in self._naming.ranges_off:
+            slots = [members.index(agent) for agent in pair]
+            kept &= ~((rows["kind"] == Kind.RANGE) & np.isin(rows["agent"], slots) & np.isin(rows["other"], slots))
+        return rows if kept.all() else rows[kept]
+
+    def note_frozen(self, *, frozen: bool) -> None:
+        """Whether the own receiver repeats a fix that its own velocity contradicts; such fixes are no rows."""
+        self._frozen = frozen
+        if not frozen:
+            self._frozen_at = None
 
     def observe(self, estimate: Estimate, present: tuple[int, ...]) -> tuple[Finding, ...]:
         """What is found with an estimate of those present, about ids, ``None`` for the own drone."""
@@ -59,6 +74,8 @@ class IntegrityWatch:
             relative = {agent: places[slot] - places[own] for slot, agent in enumerate(present) if slot != own}
             tick = BoundedTick(estimate.tick, present, own, self._taken.rows, relative)
             found = (*self._named, *self._bank.observe(tick))
+        if self._frozen:
+            found = (Finding(What.RECEIVER_FROZEN, Gravity.DEGRADED, self._agent_id), *found)
         return tuple(replace(each, about=None) if each.about == self._agent_id else each for each in found)
 
     def state(self, estimate: Estimate, present: tuple[int, ...], findings: Iterable[Finding]) -> Statement:
@@ -80,10 +97,19 @@ class IntegrityWatch:
                 if slot != own
             },
             {agent: Guaranteed(each.half_axes(), each.min_range()) for agent, each in sets.items()},
-            {agent: float(np.linalg.norm(each.shift_m)) for agent, each in self._naming.named.items()},
+            self._off(estimate.mean[position(own)]),
+            tuple(sorted(self._naming.ranges_off)),
             undetectable(self._naming.receivers),
         )
         return self.statement
+
+    def _off(self, place_m: Vector) -> dict[int, float]:
+        """Whose fixes are off, by how much; a frozen receiver by how far the drone has moved since."""
+        off = {agent: float(np.linalg.norm(each.shift_m)) for agent, each in self._naming.named.items()}
+        if self._frozen:
+            self._frozen_at = place_m.copy() if self._frozen_at is None else self._frozen_at
+            off.setdefault(self._agent_id, float(np.linalg.norm(place_m - self._frozen_at)))
+        return off
 
 
 def bounds_of(table: IntegrityTable, speed_mps: float | None) -> SensorBounds:

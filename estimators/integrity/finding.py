@@ -63,8 +63,12 @@ class What(Enum):
     """A drone's fixes and the rest of what was measured do not fit together."""
     FIXES_IGNORED = auto()
     """A drone's fixes do not fit the rest, and the position has been held without them for a while."""
+    RECEIVER_FROZEN = auto()
+    """A drone's receiver repeats one fix although the drone moves."""
     RECEIVER_OFF = auto()
     """A drone's fixes are shifted: they do not fit the ranges to the others, whose fixes do."""
+    RANGES_OFF = auto()
+    """The ranges of a pair, or all of a drone, do not fit the fixes and the other ranges."""
     SOMEBODY_OFF = auto()
     """Somebody's fixes are shifted, and it cannot be told whose."""
     DIVERGED = auto()

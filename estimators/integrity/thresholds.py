@@ -128,13 +128,19 @@ the fix."""
 
 # --- receivers that are off ---------------------------------------------------------------------------------
 
-NAMED_NATS = 8.0
-"""Odds from which on a receiver is off. In 36 minutes of fleets of three to five with errors that nobody has
-calibrated the highest of a sound one was 7.2, in one look."""
-OVERWHELMING_NATS = 15.0
-"""Odds at which one look is enough; else two in a row have to agree."""
-LEADING_NATS = 5.0
-"""Lead over every other receiver and every pair of ranges, lest the wrong one be named."""
+NAMED_NATS = 13.2
+"""Odds from which on something is off. Three sorts of faults may begin in each half second of each receiver: of so
+many in 24 drone hours, exp(13.2), at most one exceeds it by chance (Ville), as long as errors are as supposed."""
+LEADING_NATS = 6.0
+"""Lead over everything else that may be off, lest the wrong one be named: odds of 400."""
+RANGES_AGE_S = 1.5
+"""Ranges are named no earlier: a receiver that begins to be off shows in the ranges to the nearest drones first."""
+SCATTERED = 6.0
+"""Scatter of a pair's ranges, over what they claim, from which on they are off: half of sixteen have to be off by
+more than four sigma at once, so neither noise nor a few blocked ones do it; a claim is wrong by two or three."""
+AGREEING_SCATTER = 3.0
+SCATTERED_S = 1.5
+"""So long it takes to be seen."""
 AGREEING_NATS = 3.0
 AGREEING_S = 10.0
 """A receiver that is named counts again after odds below `AGREEING_NATS` for so long."""

@@ -161,11 +161,17 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
 
 
 def of_integrity(counters: Mapping[str, int]) -> dict[str, Any]:
-    """Ticks in each state, and ticks in which fixes were found to be off, by the id of their drone."""
+    """Ticks in each state, and those in which fixes, by their drone, and ranges, by their pair, were found off."""
     begin = "integrity: "
     told = {name.removeprefix(begin): count for name, count in counters.items() if name.startswith(begin)}
     off = {name.split()[2]: count for name, count in told.items() if name.startswith("fixes of ")}
-    return {"ticks": {name: count for name, count in told.items() if " of " not in name}, "ticks_fixes_off": off}
+    pairs = {
+        name.removeprefix("ranges of ").removesuffix(" off"): n
+        for name, n in told.items()
+        if name.startswith("ranges of ")
+    }
+    states = {name: count for name, count in told.items() if " of " not in name}
+    return {"ticks": states, "ticks_fixes_off": off, "ticks_ranges_off": pairs}
 
 
 def _of_errors(errors: Errors) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Ranges held against the distances between fixes: what is left over, pair by pair, in bins of half a second.
+"""Ranges held against the distances between fixes: what is left over, pair by pair, in bins of a quarter of a second.
 
 Nothing of an estimator is in it, so a poisoned estimate cannot hide what poisons it, and all drones that hold the
 same measurements find the same. A range is held against fixes interpolated to its instant: no velocity is needed, and
@@ -7,6 +7,7 @@ an interval of 0.2 s costs 2 cm at 4 m/s2. The median of a bin makes little of r
 
 from __future__ import annotations
 
+import math
 from collections import deque
 from collections.abc import Container, Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -15,7 +16,7 @@ import numpy as np
 
 from estimators.model.measurements import Kind, RowTable, Vector
 
-BIN_S = 0.5
+BIN_S = 0.25
 WAIT_S = 2.0
 """A range that no fix follows for so long is held against none."""
 LARGEST_GAP_S = 1.1
@@ -23,18 +24,36 @@ LARGEST_GAP_S = 1.1
 LATE_S = 0.3
 """So long after its end a bin is closed: the fix that surrounds its last range has come."""
 FIXES_KEPT = 64
-NEAREST_M = 3.0
+NEAREST_M = 4.0
 """Drones nearer to each other say nothing: the direction between them is not known."""
 FARTHEST_M = 1e5
 """Nor do drones that are said to be farther away: no radio reaches so far, and a liar may say anything."""
-CURVED_M2 = 2.5
+CURVED_M2 = 1.2
 """Variance of both fixes across the line between them. Over a distance d it makes the line longer by up to this
 over d, which no direction tells."""
+NORMAL_OF_MEDIAN = 1.4826
+"""1-sigma of a Gaussian by the median of its absolute value."""
+LONE_M = 0.5
+"""1-sigma of a range that is alone in its bin, so that nothing tells whether it had a line of sight."""
+SCATTER_RANGES = 24
+"""So many of a pair tell how they scatter, by how each is off the line between those before and after it."""
+LEAST_SHARE, NORMAL_OF_LEAST = 0.2, 3.947
+"""The scatter is that of the best fifth, and what makes 1-sigma of a Gaussian of it. A blocked range spoils three of
+them: of ranges of which one in thirty is blocked seven in two seconds would have to be."""
+STUCK_RANGES = 16
+"""So many times the same are no measurements: with a last digit and a noise of 1 cm, one chance in 10 000 000."""
+FEWEST_RANGES = 16
+STRAIGHT_S = 0.3
+"""Between the outer two of three, for the line to be straight: 4 m/s2 make 5 cm of it."""
+PASSING_MPS = 8.0
+"""Drones that pass each other so fast have ranges that are off a line, the more the nearer they are."""
+LEAST_SIGMA_M = 0.05
+"""No ranges are taken to be better than that."""
 
 Pair = tuple[int, int]
 """Two ids, the smaller first."""
-_Held = tuple[float, Vector, float, float]
-"""Of a range: what is left over, the direction, its variance, and that of the curvature."""
+_Held = tuple[float, Vector, float]
+"""Of a range: what is left over, the way between the fixes, and its variance."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,13 +73,19 @@ class LeftOver:
     """Median of range less distance between the fixes."""
     direction: Vector
     """``(3,)`` from the second to the first, by their fixes."""
+    distance_m: float
+    """Between their fixes, on average."""
+    scatter: float
+    """Of the ranges of late about a straight line, over the sigma that they claim."""
+    stuck: bool
+    """Whether the ranges repeat to the last digit."""
     variance_m2: float
     """Of that median, as far as ranges and the curvature of the distance go."""
 
 
 @dataclass(frozen=True, slots=True)
 class Bin:
-    """What was left over in half a second, and how well each drone's fixes of it are known."""
+    """What was left over in a quarter of a second, and how well each drone's fixes of it are known."""
 
     number: int
     pairs: Mapping[Pair, LeftOver]
@@ -123,9 +148,49 @@ class _Fixes:
         return np.asarray((1.0 - share) * self.place_m[after - 1] + share * self.place_m[after])
 
     def mean_variance(self, from_s: float, to_s: float) -> Vector | None:
-        """Of the mean of the fixes in an interval (both ends count); ``None`` where there are none."""
-        found = [v for t, v in zip(self.t_s, self.variance_m2, strict=True) if from_s <= t <= to_s]
-        return np.mean(found, axis=0) / len(found) if found else None
+        """Of the mean of a bin, such that bins next to each other, which share fixes, are as good as white.
+
+        ``None`` where there are no fixes about.
+        """
+        found = [at for at, t in enumerate(self.t_s) if from_s - LARGEST_GAP_S <= t <= to_s + LARGEST_GAP_S]
+        if len(found) < 2:
+            return None
+        apart_s = (self.t_s[found[-1]] - self.t_s[found[0]]) / (len(found) - 1)
+        return np.asarray(np.mean([self.variance_m2[at] for at in found], axis=0) * apart_s / (to_s - from_s))
+
+
+class _Scatter:
+    """Of a pair's ranges."""
+
+    def __init__(self) -> None:
+        self._last: deque[tuple[float, float]] = deque(maxlen=3)
+        self._off: deque[float] = deque(maxlen=SCATTER_RANGES)
+        self._said_m = math.nan
+        self._repeats = 0
+
+    @property
+    def stuck(self) -> bool:
+        """Whether the last so many were the same."""
+        return self._repeats >= STUCK_RANGES
+
+    def hear(self, t_s: float, said_m: float, range_m: float, sigma_m: float) -> None:
+        """The next range, as said and between the bodies; one that is late is left out."""
+        if self._last and t_s <= self._last[-1][0]:
+            return
+        self._repeats = self._repeats + 1 if said_m == self._said_m else 0
+        self._said_m = said_m
+        self._last.append((t_s, range_m))
+        if len(self._last) == 3 and t_s - self._last[0][0] <= STRAIGHT_S:
+            (t0, before), (t1, middle), (t2, after) = self._last
+            share = (t1 - t0) / (t2 - t0)
+            off = middle - (1.0 - share) * before - share * after
+            curved_m = 0.5 * (t1 - t0) * (t2 - t1) * PASSING_MPS**2 / max(range_m, 1.0)
+            self._off.append(abs(off) / (sigma_m * (1.0 + (1.0 - share) ** 2 + share**2) ** 0.5 + curved_m))
+
+    def sigmas(self) -> float:
+        """1-sigma over what is claimed; 1 where it is not told."""
+        enough = len(self._off) >= FEWEST_RANGES
+        return NORMAL_OF_LEAST * float(np.quantile(self._off, LEAST_SHARE)) if enough else 1.0
 
 
 class Baselines:
@@ -136,11 +201,17 @@ class Baselines:
         self._fixes: dict[int, _Fixes] = {}
         self._waiting: deque[_Waiting] = deque()
         self._open: dict[int, dict[Pair, list[_Held]]] = {}
+        self._scatter: dict[Pair, _Scatter] = {}
         self._next: int | None = None
 
     def take(self, evidence: SharedTick) -> list[Bin]:
         """The bins that a tick closes."""
         self._fixes = {agent: self._fixes.get(agent) or _Fixes() for agent in evidence.agents}
+        self._scatter = {pair: each for pair, each in self._scatter.items() if set(pair) <= self._fixes.keys()}
+        self._open = {
+            number: {pair: held for pair, held in pairs.items() if pair in self._scatter}
+            for number, pairs in self._open.items()
+        }
         self._hear(evidence)
         now_s = evidence.tick * self._period_s
         self._hold(now_s)
@@ -180,27 +251,35 @@ class Baselines:
                 continue
             apart = one - other + each.arms_m
             distance = float(np.linalg.norm(apart))
-            if NEAREST_M < distance < FARTHEST_M and each.range_m < FARTHEST_M:
+            if min(distance, each.range_m) > NEAREST_M and max(distance, each.range_m) < FARTHEST_M:
                 held = self._open.setdefault(int(t_s // BIN_S), {}).setdefault(pair, [])
-                held.append(
-                    (each.range_m - distance, apart / distance, each.variance_m2, (CURVED_M2 / distance) ** 2)
-                )
+                held.append((each.range_m - distance, apart, each.variance_m2))
+                between_m = each.range_m - float(apart @ each.arms_m) / distance
+                scatter = self._scatter.setdefault(pair, _Scatter())
+                scatter.hear(t_s, each.range_m, between_m, max(each.variance_m2**0.5, LEAST_SIGMA_M))
         self._waiting = still
 
     def _close(self, number: int) -> Bin:
-        pairs = {pair: _left_over(held) for pair, held in self._open.pop(number, {}).items()}
+        pairs = {pair: _left_over(held, self._scatter[pair]) for pair, held in self._open.pop(number, {}).items()}
         self._open = {each: held for each, held in self._open.items() if each > number}
         from_s = number * BIN_S
         variances = {agent: fixes.mean_variance(from_s, from_s + BIN_S) for agent, fixes in self._fixes.items()}
         return Bin(number, pairs, {agent: each for agent, each in variances.items() if each is not None})
 
 
-def _left_over(held: list[_Held]) -> LeftOver:
-    residuals, directions, variances, curved = zip(*held, strict=True)
-    direction = np.mean(directions, axis=0)
-    norm = float(np.linalg.norm(direction))
-    variance = np.pi / 2.0 * float(np.mean(variances)) / len(held) + float(np.mean(curved))  # the first a median's
-    return LeftOver(float(np.median(residuals)), direction / norm if norm > 0.0 else direction, variance)
+def _left_over(held: list[_Held], ranges: _Scatter) -> LeftOver:
+    residuals, ways, variances = zip(*held, strict=True)
+    distances = np.linalg.norm(ways, axis=1)
+    direction = np.mean(np.array(ways) / distances[:, None], axis=0)
+    norm, distance = float(np.linalg.norm(direction)), float(np.mean(distances))
+    median, scatter = float(np.median(residuals)), ranges.sigmas()
+    disagreeing = (
+        NORMAL_OF_MEDIAN * float(np.median(np.abs(np.subtract(residuals, median)))) if len(held) > 1 else LONE_M
+    )
+    spread = max(float(np.mean(variances)) * max(scatter, 1.0) ** 2, disagreeing**2)
+    variance = np.pi / 2.0 * spread / len(held) + (CURVED_M2 / distance) ** 2
+    unit = direction / norm if norm > 0.0 else direction
+    return LeftOver(median, unit, distance, scatter, ranges.stuck, variance)
 
 
 def _fixes_of(rows: RowTable, t_s: Vector) -> Iterable[tuple[int, float, list[int]]]:

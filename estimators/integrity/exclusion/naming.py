@@ -1,120 +1,273 @@
-"""Whose receiver is off: suspected, confirmed, named, and taken back.
+"""Whose fixes or ranges are off: suspected, confirmed, named, and taken back.
 
-A receiver is named when its odds (`receiver_faults`) are high and lead those of every other receiver and every pair
-of ranges, at once where they are overwhelming, else twice in a row. From then on its fixes explain nothing: the
-odds of the others are those without it. It is taken back when it has agreed with the others for a while. With fewer
-than four receivers it can be seen that one is off, not which; and where all are off alike, nothing can be seen at
-all.
+Something is named when its odds (`fault_odds`) are high, and lead those of everything else. What it has done to the
+filter of slow errors is taken out then, and from then on it explains nothing. It is taken back when it has agreed
+with the others for a while. With fewer than four receivers it can be seen that one is off, not which; and where all
+are off alike, nothing can be seen at all.
 """
 
 from __future__ import annotations
 
+from collections import deque
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.integrity.exclusion.baselines import BIN_S, Baselines, Bin, SharedTick
-from estimators.integrity.exclusion.receiver_faults import Odds, largest, odds
+from estimators.integrity.exclusion.baselines import BIN_S, Baselines, Bin, Pair, SharedTick
+from estimators.integrity.exclusion.fault_odds import RANGES_STEP_M, STEP_M, FaultOdds, LikelyFault, Odds
+from estimators.integrity.exclusion.slow_errors import SlowErrors
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.thresholds import (
     AGREEING_NATS,
     AGREEING_S,
+    AGREEING_SCATTER,
     FEWEST_RECEIVERS,
     LEADING_NATS,
     NAMED_NATS,
-    OVERWHELMING_NATS,
+    RANGES_AGE_S,
+    SCATTERED,
+    SCATTERED_S,
 )
-from estimators.model.measurements import Vector
+from estimators.model.measurements import Matrix, Vector
 
-EPOCHS_BACK = (0, 4, 20, 60)
-"""Bins that are looked at together: now, and 2, 10 and 30 s ago."""
+LONGEST_GAP_BINS = 480
+"""After so long without anything to be held against anything, the slow errors are begun anew."""
+
+BINS_KEPT = 40
+"""Of a fault that is so young all is begun again from before it, without whom it is of."""
+BINS_BEFORE = 4
+"""So many before its likeliest begin."""
+
+Whose = int | Pair
+"""A drone, of its receiver; or a pair, of its ranges."""
 
 
 @dataclass(frozen=True, slots=True)
 class Named:
-    """A receiver that is off."""
+    """Something that is off."""
 
     since_tick: int
     odds_nats: float
     shift_m: Vector
-    """``(3,)`` NED, of now."""
+    """Of now: ``(3,)`` NED of a receiver, ``(1,)`` of ranges."""
     agreeing_s: float = 0.0
 
 
 class NamingMonitor:
-    """Names receivers; ``own`` is whose place `separation_m` is of."""
+    """Names receivers and ranges; ``own`` is whose place `separation_m` is of."""
 
     def __init__(self, own: int, period_s: float) -> None:
         self._own = own
         self._baselines = Baselines(period_s)
-        self._bins: dict[int, Bin] = {}
-        self._suspect: int | None = None
+        self._slow = SlowErrors()
+        self._odds = FaultOdds(AGREEING_NATS)
+        self._before: deque[tuple[Bin, Vector, Matrix]] = deque(maxlen=BINS_KEPT)
+        """The last bins, and what was known before each."""
+        self._last: int | None = None
+        """The last bin taken in."""
         self.named: dict[int, Named] = {}
-        """By id."""
+        """Receivers that are off, by id."""
+        self.ranges_off: dict[Pair, Named] = {}
+        """Ranges that are off."""
         self.unattributable_nats = 0.0
         """Odds of somebody being off where it cannot be told who; 0: nobody, or it can."""
-        self.separation_m = np.zeros(3)
-        """``(3,)``, per axis: how far the own place moves at most if one receiver that does not agree is left out."""
+        self.separation_m: Vector = np.zeros(3)
+        """``(3,)``, per axis: how far the own place moves at most if a receiver or ranges that do not agree are left
+        out."""
         self.receivers = 0
         """Receivers not named that are ranged to."""
 
     def observe(self, evidence: SharedTick) -> tuple[Finding, ...]:
-        """A finding about each receiver that is off; one about nobody where it cannot be told whose."""
+        """A finding about each receiver and pair that is off; one about nobody where it is not told whose."""
+        if set(evidence.agents) != set(self._slow.agents):
+            self._keep(evidence.agents)
         for closed in self._baselines.take(evidence):
-            oldest = closed.number - max(EPOCHS_BACK)
-            self._bins = {number: each for number, each in self._bins.items() if number >= oldest}
-            self._bins[closed.number] = closed
             self._look(closed, evidence.tick)
-        self.named = {agent: each for agent, each in self.named.items() if agent in evidence.agents}
-        found = [
-            Finding(What.RECEIVER_OFF, Gravity.DEGRADED, agent, float(np.linalg.norm(each.shift_m)))
-            for agent, each in sorted(self.named.items())
-        ]
+        return tuple(self._findings())
+
+    def _findings(self) -> Iterator[Finding]:
+        for agent, each in sorted(self.named.items()):
+            yield Finding(What.RECEIVER_OFF, Gravity.DEGRADED, agent, float(np.linalg.norm(each.shift_m)))
+        for pair, each in sorted(self.ranges_off.items()):
+            detail = f"ranges between {pair[0]} and {pair[1]}"
+            yield Finding(What.RANGES_OFF, Gravity.DEGRADED, pair[0], float(each.shift_m[0]), detail=detail)
         if self.unattributable_nats:
-            value = self.unattributable_nats
-            found.append(Finding(What.SOMEBODY_OFF, Gravity.ALARM, value=value, limit=NAMED_NATS))
-        return tuple(found)
+            yield Finding(What.SOMEBODY_OFF, Gravity.ALARM, value=self.unattributable_nats, limit=NAMED_NATS)
+
+    def _keep(self, agents: tuple[int, ...]) -> None:
+        self._slow.keep(agents)
+        self._odds.restart(self._slow)
+        self._before.clear()
+        self.named = {agent: each for agent, each in self.named.items() if agent in agents}
+        self.ranges_off = {pair: each for pair, each in self.ranges_off.items() if set(pair) <= set(agents)}
 
     def _look(self, closed: Bin, tick: int) -> None:
-        epochs = [self._bins[closed.number - back] for back in EPOCHS_BACK if closed.number - back in self._bins]
-        now = odds(epochs, self.named, self._own)
-        if not now.receivers:
-            return
-        self.receivers = len(now.receivers)
-        moved = [np.abs(each) for agent, each in now.separations_m.items() if now.receivers[agent] > AGREEING_NATS]
-        self.separation_m = np.asarray(np.max(moved, axis=0)) if moved else np.zeros(3)
-        self._judge(now, tick)
+        self._pass_by(closed.number)
+        self._before.append((closed, self._slow.state, self._slow.covariance.copy()))
+        self._find_spoiled(closed, tick)
+        there = [pair for pair in closed.pairs if all(agent in closed.fix_variance_m2 for agent in pair)]
+        chosen = self._chosen(closed)
+        if chosen:
+            fresh = self._slow.fresh(closed, chosen)
+            now = self._odds.take(closed.number, self._slow, fresh, self._slow.take(fresh))
+            self.receivers = len({agent for pair in chosen for agent in pair})
+            self.separation_m = self._separation(now)
+            self._judge(now, tick)
         for agent in list(self.named):
-            self._reconsider(agent, epochs)
-        # what a receiver said before it was named, and while it is, says nothing of it once it is taken back
-        self._bins = {number: each.without(self.named) for number, each in self._bins.items()}
+            mine = sorted(pair for pair in there if agent in pair and not self._is_doubted(pair, but=agent))
+            self._reconsider_receiver(agent, closed, mine)
+        for pair in list(self.ranges_off):
+            if pair in there and not self._is_doubted(pair, but=pair):
+                self._reconsider_ranges(pair, closed)
+
+    def _find_spoiled(self, closed: Bin, tick: int) -> None:
+        """Ranges that repeat, or scatter as without a line of sight, are off, whatever their mean is.
+
+        Where nearly all scatter it is what they claim that is wrong.
+        """
+        usual = max(float(np.quantile([each.scatter for each in closed.pairs.values()] or [1.0], 0.25)), 1.0)
+        known = closed.pairs.items()
+        found = {pair: each for pair, each in known if each.stuck or each.scatter > SCATTERED * usual}
+        fresh = {pair: each for pair, each in found.items() if pair not in self.ranges_off}
+        for pair, each in fresh.items():
+            self.ranges_off[pair] = Named(tick, NAMED_NATS, np.array([each.residual_m]))
+        if fresh:
+            self._begin_again(SCATTERED_S)
+            self._odds.restart(self._slow)
+
+    def _pass_by(self, number: int) -> None:
+        passed = 1 if self._last is None else number - self._last
+        if not 0 < passed <= LONGEST_GAP_BINS:
+            self._slow.forget(range(len(self._slow.state)))
+            self._odds.restart(self._slow)
+            self._before.clear()
+        else:
+            self._slow.pass_by(passed)
+            self._odds.pass_by(self._slow, passed)
+        self._last = number
+
+    def _is_doubted(self, pair: Pair, but: Whose | None = None) -> bool:
+        """Whether what is left over of a pair is of somebody who is off, besides one."""
+        off: list[Whose] = [*self.named, *self.ranges_off]
+        return any(_is_of(pair, whose) for whose in off if whose != but)
 
     def _judge(self, now: Odds, tick: int) -> None:
-        agent, lead = largest(now.receivers)
-        assert agent is not None
-        nats = now.receivers[agent]
-        lead = min(lead, nats - max(now.pairs.values(), default=0.0))
         self.unattributable_nats = 0.0
-        if nats <= NAMED_NATS:
-            self._suspect = None
-        elif self.receivers < FEWEST_RECEIVERS:
-            self.unattributable_nats = nats
-        elif lead <= LEADING_NATS:
-            self._suspect = None
-        elif nats > OVERWHELMING_NATS or agent == self._suspect:
-            self.named[agent] = Named(tick, nats, now.shifts_m[agent])
-            self._suspect = None
-        else:
-            self._suspect = agent
-
-    def _reconsider(self, agent: int, epochs: list[Bin]) -> None:
-        """Take a named receiver back once it agrees with those who are not named."""
-        again = odds(epochs[:1], [each for each in self.named if each != agent])
-        if agent not in again.receivers:
+        ranked: list[tuple[int | tuple[Pair, ...], LikelyFault]] = [*now.receivers.items(), *now.ranges.items()]
+        if not ranked:
             return
-        nats, held = again.receivers[agent], self.named[agent]
-        agreeing_s = held.agreeing_s + BIN_S if nats < AGREEING_NATS else 0.0
-        if agreeing_s > AGREEING_S:
-            del self.named[agent]
+        whose, fault = max(ranked, key=lambda entry: entry[1].nats)
+        if fault.nats <= NAMED_NATS:
+            return
+        if self.receivers < FEWEST_RECEIVERS:
+            self.unattributable_nats = fault.nats
+            return
+        rival_nats = max((each.nats for other, each in ranked if not _holds(other, whose)), default=0.0)
+        if fault.nats - rival_nats > LEADING_NATS:
+            self._name(whose, fault, tick)
+
+    def _name(self, whose: int | tuple[Pair, ...], fault: LikelyFault, tick: int) -> None:
+        if not isinstance(whose, int) and fault.age_s < RANGES_AGE_S:
+            return
+        if isinstance(whose, int):
+            self.named[whose] = Named(tick, fault.nats, fault.shift_m)
         else:
-            self.named[agent] = replace(held, odds_nats=nats, shift_m=again.shifts_m[agent], agreeing_s=agreeing_s)
+            shifts = fault.shift_m * ((1.0, -1.0) if len(whose) == 2 else np.ones(len(whose)))
+            for pair, shift in zip(whose, shifts, strict=True):
+                self.ranges_off[pair] = Named(tick, fault.nats, np.array([shift]))
+        self._unlearn(fault)
+        if isinstance(whose, int):
+            self._slow.forget(self._slow.of_agent(whose))
+        self._odds.restart(self._slow)
+
+    def _unlearn(self, fault: LikelyFault) -> None:
+        """What a fault has taught: begin again from before it; of an old one, which is small, take out its effect."""
+        if not self._begin_again(fault.age_s):
+            self._slow.correct(fault.effect, fault.error, fault.covariance)
+
+    def _begin_again(self, age_s: float) -> bool:
+        """Learn again from what was a while ago on, without who is off; false where that is not kept."""
+        back = round(age_s / BIN_S) + BINS_BEFORE
+        if back > len(self._before):
+            return False
+        again = list(self._before)[-back:]
+        _, self._slow.state, self._slow.covariance = again[0]
+        for at, (made, _, _) in enumerate(again):
+            if at:
+                self._slow.pass_by(made.number - again[at - 1][0].number)
+            chosen = self._chosen(made)
+            if chosen:
+                self._slow.take(self._slow.fresh(made, chosen))
+        return True
+
+    def _chosen(self, made: Bin) -> list[Pair]:
+        """The pairs of nobody who is off."""
+        known = made.fix_variance_m2
+        return sorted(pair for pair in made.pairs if set(pair) <= known.keys() and not self._is_doubted(pair))
+
+    def _separation(self, now: Odds) -> Vector:
+        """How far the own place moves if somebody who does not agree is left out."""
+        if self._own not in self._slow.agents:
+            return np.zeros(3)
+        own = list(self._slow.of_agent(self._own))
+        moved: list[Vector] = [np.zeros(3)]
+        for agent, each in now.receivers.items():
+            shift = each.shift_m if agent == self._own else 0.0
+            moved.append(np.abs(each.effect[own] @ each.error - shift))
+        for each in now.ranges.values():
+            moved.append(np.abs(each.effect[own] @ each.error))
+        return np.asarray(np.max(moved, axis=0))
+
+    def _reconsider_receiver(self, agent: int, closed: Bin, mine: list[Pair]) -> None:
+        """Take a named receiver back once it agrees with those who are not named."""
+        if not mine:
+            return
+        fresh = self._slow.fresh(closed, mine)
+        columns = fresh.whiten @ (fresh.sign(agent)[:, None] * fresh.directions)
+        again = _again(self.named[agent], *_alone(fresh.value, columns, np.square(STEP_M)))
+        if again is None:
+            del self.named[agent]
+            self._slow.forget(self._slow.of_agent(agent))
+        else:
+            self.named[agent] = again
+
+    def _reconsider_ranges(self, pair: Pair, closed: Bin) -> None:
+        """The same of ranges."""
+        fresh = self._slow.fresh(closed, [pair])
+        nats, shift_m = _alone(fresh.value, fresh.whiten, np.square([RANGES_STEP_M]))
+        spoiled = closed.pairs[pair].stuck or closed.pairs[pair].scatter > AGREEING_SCATTER
+        again = _again(self.ranges_off[pair], NAMED_NATS if spoiled else nats, shift_m)
+        if again is None:
+            del self.ranges_off[pair]
+        else:
+            self.ranges_off[pair] = again
+
+
+def _is_of(pair: Pair, whose: Whose) -> bool:
+    return whose in pair if isinstance(whose, int) else whose == pair
+
+
+def _holds(other: int | tuple[Pair, ...], whose: int | tuple[Pair, ...]) -> bool:
+    """Whether somebody's being off holds that of somebody else, so that it explains no less and is no rival."""
+    if isinstance(other, int) or isinstance(whose, int):
+        return other == whose
+    return set(whose) <= set(other)
+
+
+def _again(held: Named, nats: float, shift_m: Vector) -> Named | None:
+    """What is held of somebody who is off after another bin; ``None``: it has agreed for long enough."""
+    agreeing_s = held.agreeing_s + BIN_S if nats < AGREEING_NATS else 0.0
+    if agreeing_s > AGREEING_S:
+        return None
+    return replace(held, odds_nats=nats, shift_m=shift_m, agreeing_s=agreeing_s)
+
+
+def _alone(fresh: Vector, columns: Matrix, variance: Vector) -> tuple[float, Vector]:
+    """Odds, nats, of an error along whitened columns ``(m, k)``, of a prior ``variance`` ``(k,)``, against none in
+    one bin alone; and that error, its mean."""
+    projected = columns.T @ fresh
+    information = columns.T @ columns + np.diag(1.0 / variance)
+    error = np.asarray(np.linalg.solve(information, projected), np.float64)
+    size = float(np.linalg.slogdet(information * variance)[1])
+    return 0.5 * float(projected @ error) - 0.5 * size, error

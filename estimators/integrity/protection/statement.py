@@ -63,6 +63,8 @@ class Statement:
     """By id; none where the bounds of the sensors say nothing."""
     off: Mapping[int, float]
     """Whose fixes are off, by id, and by how many metres."""
+    ranges_off: tuple[tuple[int, int], ...]
+    """Between whom ranges are off, by id."""
     undetectable: tuple[str, ...]
     """What could be wrong and would not be seen, always."""
 

@@ -81,3 +81,31 @@ def test_bounds_come_from_the_configuration() -> None:
     assert stated.position_m == (2.0, 2.0, 3.0)
     assert (stated.velocity_mps, stated.speed_mps) == (0.5, 9.0)
     assert bounds_of(IntegrityTable(position_bound_m=2.0), None).position_m == (2.0, 2.0, 2.0)
+
+
+def test_ranges_that_are_off_do_not_reach_the_estimator() -> None:
+    made = IntegrityWatch(fleet_config(ids=IDS), 1)
+    for tick, rows in rows_of_flight(5, 6, 24.0):
+        ends = np.isin(rows["agent"], (1, 3)) & np.isin(rows["other"], (1, 3))
+        off = (rows["kind"] == Kind.RANGE) & ends
+        rows["value"][off] += 8.0 * (tick >= 200)
+        left = made.take(tick, IDS, rows)
+    np.testing.assert_array_equal(left, rows[~off])
+    (found,) = (each for each in made.observe(estimate(tick), IDS) if each.what is What.RANGES_OFF)
+    stated = made.state(estimate(tick), IDS, (found,))
+    assert stated.ranges_off == ((2, 4),)
+    assert str(stated).startswith("DEGRADED: ranges between 2 and 4 off by ")
+
+
+def test_a_frozen_receiver_is_off_by_how_far_its_drone_has_moved_since() -> None:
+    made = IntegrityWatch(fleet_config(ids=IDS), 2)
+    made.note_frozen(frozen=True)
+    (found,) = made.observe(estimate(1), IDS)
+    assert (found.what, found.about) == (What.RECEIVER_FROZEN, None)
+    assert made.state(estimate(1), IDS, ()).off == {2: 0.0}
+    later = estimate(2)
+    later.mean[6:9] += (3.0, 4.0, 0.0)
+    assert made.state(later, IDS, ()).off == {2: pytest.approx(5.0)}
+    made.note_frozen(frozen=False)
+    assert made.observe(estimate(3), IDS) == ()
+    assert made.state(estimate(3), IDS, ()).off == {}

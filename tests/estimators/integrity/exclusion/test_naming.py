@@ -6,14 +6,16 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
-from estimators.integrity.exclusion.baselines import SharedTick
+from estimators.integrity.exclusion.baselines import Pair, SharedTick
 from estimators.integrity.exclusion.naming import NamingMonitor
 from estimators.integrity.finding import What, has
-from estimators.model.measurements import Kind
+from estimators.model.measurements import Kind, RowTable
 from tests.support.uncalibrated_fleet import PERIOD_S, Shift, jump, no_shift, ramp, rows_of_flight
 
 BEGUN_S = 30.0
@@ -45,7 +47,7 @@ def test_nobody_is_named_where_nobody_is_off(drones: int, calibrated: bool) -> N
         assert monitor.receivers == drones
 
 
-@pytest.mark.parametrize(("rate_mps", "within_s"), [(5.0, 2.5), (0.5, 13.0), (0.1, 70.0)])
+@pytest.mark.parametrize(("rate_mps", "within_s"), [(5.0, 3.0), (0.5, 12.0), (0.1, 65.0)])
 @pytest.mark.parametrize("seed", range(SEEDS))
 def test_a_receiver_that_is_dragged_away_is_named(rate_mps: float, within_s: float, seed: int) -> None:
     slot = seed % 5
@@ -91,13 +93,105 @@ def test_two_are_named_one_after_the_other() -> None:
     assert [named for _, named in changes] == [{1}, {1, 4}]
 
 
-def test_a_pair_whose_ranges_are_off_names_no_receiver() -> None:
-    monitor = NamingMonitor(1, PERIOD_S)
-    for tick, rows in rows_of_flight(5, 6, 40.0):
-        stuck = (rows["kind"] == Kind.RANGE) & (rows["agent"] == 1) & (rows["other"] == 3) & (tick > 200)
-        rows["value"][stuck] += 8.0
-        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+Spoiled = Callable[[RowTable, float], None]
+"""(rows of a tick, seconds since the fault began): what becomes of them."""
+
+
+def spoiled(
+    seed: int, spoil: Spoiled, duration_s: float = 12.0
+) -> tuple[NamingMonitor, list[tuple[float, set[Pair]]]]:
+    """The monitor of a fleet of five, and each change of whose ranges are off, since the fault began."""
+    monitor, changes = NamingMonitor(1, PERIOD_S), [(0.0, set[Pair]())]
+    for tick, rows in rows_of_flight(5, seed, 20.0 + duration_s):
+        if tick >= 200:
+            spoil(rows, tick * PERIOD_S - 20.0)
+        found = monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+        assert len([each for each in found if each.what is What.RANGES_OFF]) == len(monitor.ranges_off)
+        if set(monitor.ranges_off) != changes[-1][1]:
+            changes.append((tick * PERIOD_S - 20.0, set(monitor.ranges_off)))
+    return monitor, changes[1:]
+
+
+def between(rows: RowTable, one: int, other: int) -> NDArray[np.intp]:
+    """The ranges between two slots."""
+    ends = np.isin(rows["agent"], (one, other)) & np.isin(rows["other"], (one, other))
+    return np.flatnonzero((rows["kind"] == Kind.RANGE) & ends)
+
+
+def test_a_pair_whose_ranges_are_off_is_named_and_no_receiver_and_taken_back() -> None:
+    def off_for_five_seconds(rows: RowTable, t_s: float) -> None:
+        rows["value"][between(rows, 1, 3)] += 8.0 * (t_s < 5.0)
+
+    monitor, changes = spoiled(6, off_for_five_seconds, 20.0)
     assert monitor.named == {}
+    (named, taken_back) = changes
+    assert named[1] == {(2, 4)}
+    assert named[0] <= 3.0
+    assert taken_back[1] == set()
+    assert 10.0 <= taken_back[0] - 5.0 <= 13.0
+
+
+def test_ranges_that_are_stuck_are_named() -> None:
+    held: list[float] = []
+
+    def stuck(rows: RowTable, t_s: float) -> None:
+        held.extend(rows["value"][between(rows, 0, 2)][: not held])
+        rows["value"][between(rows, 0, 2)] = held[0]
+
+    monitor, changes = spoiled(1, stuck)
+    assert monitor.named == {}
+    assert changes[0][1] == {(1, 3)}
+    assert changes[0][0] <= 3.0
+
+
+def test_two_ranges_that_are_swapped_are_named() -> None:
+    def swapped(rows: RowTable, t_s: float) -> None:
+        one, other = between(rows, 0, 1)[0], between(rows, 0, 3)[0]
+        rows["value"][[one, other]] = rows["value"][[other, one]]
+
+    monitor, changes = spoiled(2, swapped)
+    assert monitor.named == {}
+    assert changes[-1][1] == {(1, 2), (1, 4)}
+
+
+def test_a_drone_without_line_of_sight_is_named_by_its_ranges() -> None:
+    rng = np.random.default_rng(1)
+
+    def blocked(rows: RowTable, t_s: float) -> None:
+        of = (rows["kind"] == Kind.RANGE) & ((rows["agent"] == 2) | (rows["other"] == 2))
+        rows["value"][of] += rng.exponential(2.0, np.count_nonzero(of))
+
+    monitor, changes = spoiled(3, blocked)
+    assert monitor.named == {}
+    (when,) = {t_s for t_s, pairs in changes if pairs == {(1, 3), (2, 3), (3, 4), (3, 5)}}
+    assert when <= 3.0
+
+
+def test_ranges_that_all_scatter_alike_are_used() -> None:
+    # what they claim is wrong, not one of them
+    rng = np.random.default_rng(1)
+
+    def noisy(rows: RowTable, t_s: float) -> None:
+        of = rows["kind"] == Kind.RANGE
+        rows["value"][of] += rng.normal(0.0, 1.0, np.count_nonzero(of))
+
+    monitor, changes = spoiled(3, noisy)
+    assert changes == []
+    assert monitor.named == {}
+
+
+def test_a_receiver_that_repeats_one_fix_is_named() -> None:
+    monitor, named_after_s = NamingMonitor(1, PERIOD_S), list[float]()
+    for tick, rows in rows_of_flight(5, 1, 26.0):
+        fix = np.flatnonzero((rows["kind"] == Kind.POSITION) & (rows["agent"] == 3))
+        if tick == 200:
+            held = rows["value"][fix]
+        if tick >= 200 and len(fix):
+            rows["value"][fix] = held
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+        named_after_s += [tick * PERIOD_S - 20.0] if monitor.named else []
+    assert set(monitor.named) == {4}
+    assert named_after_s[0] <= 4.0
 
 
 def test_a_member_that_says_it_is_nowhere_harms_nobody_else() -> None:

@@ -21,6 +21,15 @@ Overrides = Annotated[
 ]
 Loss = Annotated[float | None, typer.Option("--loss", metavar="SHARE", help="Packets that are lost, 0..1.")]
 Delay = Annotated[float | None, typer.Option("--delay", metavar="S", help="Delay of every packet, s.")]
+Require = Annotated[
+    str | None,
+    typer.Option(
+        "--require",
+        metavar="LIMITS",
+        help="Exit 1 unless the fleet keeps these: availability=0.99,rmse=0.5; also on_time, rmse_after_10s, "
+        "fleet_error, anees.",
+    ),
+]
 FiguresFile = Annotated[
     Path | None, typer.Option("--json", metavar="FILE", help="Write the figures here too; - is the terminal.")
 ]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from fleetloc.errors import INTERRUPTED, InputError
-from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles, with_options
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Profiles, Require, with_options
 
 if TYPE_CHECKING:
     from agent.config.documents import Override
@@ -38,6 +38,7 @@ def fleet(
         Path | None, typer.Option("--out", help="Folder of the run; default: out/<fleet>, or fleetloc-demo.")
     ] = None,
     json_file: FiguresFile = None,
+    require: Require = None,
     profiles: Profiles = None,
     overrides: Overrides = None,
     lockstep: Annotated[
@@ -46,12 +47,16 @@ def fleet(
 ) -> None:
     """Fly a simulated fleet, one daemon per drone, and report.
 
-    Ends after the duration or on Ctrl-C; the report is written in either case.
+    Ends after the duration, on Ctrl-C, or when no daemon is left; the report is written in each case. The verdict
+    says whether the run was as wanted; exit 1 if no drone had an estimate, or a limit of --require is not kept.
     """
+    from fleetloc.errors import FAILED
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files
+    from fleetloc.verdict import read_requirements
     from fleetloc.warmup import announce, warm_up_everything
 
+    required = read_requirements(require or "")
     if demo:
         out = out or Path(DEMO_FOLDER)
     config = _chosen(config, demo)
@@ -76,8 +81,12 @@ def fleet(
         outcome = _fly(fleet_config, folder)
         if outcome.wall_s == 0.0:  # interrupted before anything flew
             raise typer.Exit(INTERRUPTED)
-    write_report(fleet_config, folder, outcome, json_file, "lockstep" if lockstep else "live")
+    figures = write_report(
+        fleet_config, folder, outcome, json_file, "lockstep" if lockstep else "live", required
+    )
     typer.echo(f"report: {folder / run_files.REPORT_HTML}")
+    if figures["verdict"]["failed"]:
+        raise typer.Exit(FAILED)
 
 
 def _chosen(config: Path | None, demo: bool) -> Path:

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from fleetloc.options import FiguresFile, FleetFile, Overrides, Profiles
+from fleetloc.options import FiguresFile, FleetFile, Overrides, Profiles, Require
 
 LOOK_PERIOD_S = 0.2
 
@@ -24,6 +24,7 @@ def report(
     json_file: FiguresFile = None,
     profiles: Profiles = None,
     overrides: Overrides = None,
+    require: Require = None,
     wait_s: Annotated[
         float, typer.Option("--wait", help="Wait at most so many seconds for a run that ends after this began.")
     ] = 0.0,
@@ -33,22 +34,27 @@ def report(
     It writes report.json and report.html, as `fleetloc fleet` does at its end.
     """
     from agent.config.reading import load_config
-    from fleetloc.errors import InputError
+    from fleetloc.errors import FAILED, InputError
     from fleetloc.report.fleet_report import write_report
     from fleetloc.run import run_files
     from fleetloc.run.fleet_run import RunOutcome
+    from fleetloc.verdict import read_requirements
 
+    required = read_requirements(require or "")
     fleet = load_config(config, overrides or (), profiles or ())
     records = [run_files.record_path(directory, agent_id) for agent_id in fleet.ids]
     ends = [directory / run_files.SIMULATOR_JSON, *(path.with_suffix(run_files.SUMMARY_SUFFIX) for path in records)]
     if wait_s > 0.0:
         _wait_for(ends, wait_s)
-    for needed in (directory / run_files.TRUTH, *records):
+    some = next((path for path in records if path.is_file()), records[0])
+    for needed in (directory / run_files.TRUTH, some):
         if not needed.is_file():
             expected = f"{needed.name}, which `fleetloc sim --out` and `fleetloc agent --out` write"
             raise InputError(str(directory), "", expected, "no such file")
-    write_report(fleet, directory, RunOutcome(), json_file, "live")
+    figures = write_report(fleet, directory, RunOutcome(), json_file, "live", required)
     typer.echo(f"report: {directory / run_files.REPORT_HTML}")
+    if figures["verdict"]["failed"]:
+        raise typer.Exit(FAILED)
 
 
 def _wait_for(files: list[Path], wait_s: float) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -22,6 +22,7 @@ from fleetloc.report.target_results import COLUMNS as TARGET_COLUMNS
 from fleetloc.report.target_results import target_cells
 from fleetloc.run import run_files
 from fleetloc.run.fleet_run import RunOutcome
+from fleetloc.verdict import verdict
 from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
 
@@ -32,15 +33,29 @@ SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "range": "uwb"}
 
 
 def write_report(
-    config: FleetConfig, directory: Path, outcome: RunOutcome, json_file: Path | None, mode: str
+    config: FleetConfig,
+    directory: Path,
+    outcome: RunOutcome,
+    json_file: Path | None,
+    mode: str,
+    required: Mapping[str, float] | None = None,
 ) -> dict[str, Any]:
-    """Read the run's files, write ``report.json`` and ``report.html``, print the figures; returns them."""
+    """Read the run's files, write ``report.json`` and ``report.html``, print the figures; returns them.
+
+    Their ``verdict`` says whether the run was as wanted; ``required`` are the limits of `fleetloc.verdict`.
+    Files that cannot be read are named, and done without.
+    """
     results = load_results(config, directory)
     figures = report_figures(config, results, directory, outcome, mode)
+    found = verdict(figures, required or {})
+    figures["verdict"] = {"line": found.line, "failed": found.failed}
+    for line in results.unread:
+        typer.echo(f"fleetloc: left out: {line}", err=True)
     for path in (directory / run_files.REPORT_JSON, *([json_file] if json_file else [])):
         write_json(path, figures)
     (directory / run_files.REPORT_HTML).write_text(page(config, results, figures), encoding="utf-8")
     _print(figures)
+    typer.echo(found.line)
     if not is_installed("report"):
         typer.echo(f"note: {sentence('report', f'{run_files.REPORT_HTML} has no plots')}")
     return figures

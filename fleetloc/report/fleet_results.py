@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.fleet.membership import is_absent
-from agent.log.estimate_log import covariance_of, entry_dtype, read_entries, variances_of
+from agent.log.estimate_log import covariance_of, entry_dtype, variances_of
 from estimators.estimator import Status
 from estimators.integrity.consistency import nees
 from estimators.model.layout import STATES_PER_AGENT, Layout, position
@@ -91,22 +91,26 @@ class FleetResults:
     period_s: float
     tracks: tuple[AgentTrack, ...]
     targets: tuple[TargetTrack, ...] = ()
+    unread: tuple[str, ...] = ()
+    """A line for each record that could not be read, or is not there."""
 
 
 def load_results(config: FleetConfig, directory: Path) -> FleetResults:
-    """Read the truth and every record; raises `TruthError` or `LogFileError` naming the file that cannot be used."""
+    """Read the truth and what there is of records; raises `TruthError` naming the file that cannot be used."""
     truth = load_truth(directory / run_files.TRUTH)
     start_unix_s, end_unix_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
-    tracks = tuple(_track(config, directory, agent_id, truth) for agent_id in config.ids)
+    unread: list[str] = []
+    tracks = tuple(_track(config, directory, agent_id, truth, unread) for agent_id in config.ids)
     targets = target_tracks(config, directory, truth, {track.agent_id: track.ticks_expected for track in tracks})
-    return FleetResults(truth, start_unix_s, end_unix_s - start_unix_s, config.fleet.period_s, tracks, targets)
+    duration_s = end_unix_s - start_unix_s
+    return FleetResults(truth, start_unix_s, duration_s, config.fleet.period_s, tracks, targets, tuple(unread))
 
 
-def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) -> AgentTrack:
+def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth, unread: list[str]) -> AgentTrack:
     period_s, epoch_s = config.fleet.period_s, config.fleet.epoch_unix_s
     start_s, end_s = (float(truth.time_unix_s[i]) - epoch_s for i in (0, -1))
-    paths = run_files.records(directory, agent_id)
-    parts = [read_entries(path)[1] for path in paths]
+    parts, broken = run_files.readable_entries(directory, agent_id)
+    unread += broken
     entries = np.concatenate(parts) if parts else np.empty(0, entry_dtype(len(config.bodies)))
     # the ticks that began and ended while the world moved
     inside = (entries["t_s"] >= start_s - ROUNDING_S) & (entries["t_s"] + period_s <= end_s + ROUNDING_S)
@@ -126,7 +130,7 @@ def _track(config: FleetConfig, directory: Path, agent_id: int, truth: Truth) ->
     return AgentTrack(
         agent_id=agent_id,
         ticks_expected=ticks_expected,
-        records=len(paths),
+        records=len(parts),
         time_s=entries["t_s"] - start_s,
         own_m=entries["mean"][:, own],
         own_sigma_m=np.sqrt(covariance_diagonal).reshape(len(entries), 3),

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.fleet.membership import is_absent
-from agent.log.estimate_log import covariance_of, read_entries
+from agent.log.estimate_log import covariance_of
 from estimators.estimator import Status
 from estimators.integrity.consistency import nees, rms
 from estimators.model.layout import position
@@ -96,8 +96,8 @@ def _track(
     body, bodies, epoch_s = config.bodies.index(target_id), len(config.bodies), config.fleet.epoch_unix_s
     first_s, last_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
     columns: list[tuple[float, Floats, Floats, Floats, float, bool]] = []
-    for path in run_files.records(directory, agent_id):
-        for entry in read_entries(path)[1]:
+    for part in run_files.readable_entries(directory, agent_id)[0]:
+        for entry in part:
             unix_s = float(entry["t_s"]) + epoch_s
             gone = is_absent(entry["age_ticks"][body : body + 1])[0] or entry["status"] == Status.NO_DATA
             if gone or not first_s <= unix_s <= last_s:

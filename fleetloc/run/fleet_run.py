@@ -19,7 +19,7 @@ from fleetloc.errors import BAD_INPUT, REFUSED, FleetlocError
 from fleetloc.run import live_table, live_targets, run_files
 from fleetloc.run.fleet_observer import RunObserver
 from fleetloc.run.live_truth import LiveTruth
-from fleetloc.run.processes import Child, cpu_time_s, resident_mb, stop_all
+from fleetloc.run.processes import GRACE_S, Child, cpu_time_s, resident_mb, stop_all
 from sim_bridge.uwb_modules.terminals import device_path
 from sim_bridge.world.sim_table import sim_table
 from transport.messages.report_body import Diagnostics
@@ -27,6 +27,12 @@ from transport.messages.report_body import Diagnostics
 START_TIMEOUT_S = 120.0
 """All daemons have to be there within this, on the slowest machine."""
 REFRESH_S, LINE_PERIOD_S, WATCH_S = 0.5, 10.0, 0.1
+SIMULATOR_GRACE_S = 5.0
+"""After Ctrl-C the simulator has this long to write its truth, a second one kills everything."""
+DAEMONS_GRACE_S = 3.0
+"""And the daemons so long to end after that."""
+LATE_SHARE, SAID_EVERY_S = 0.1, 30.0
+"""Ticks late since the last look from which on the machine is said to be overloaded, and how often."""
 LAST_TICKS_S = 0.5
 """After the simulator has ended the daemons have this long for the last tick."""
 STOP_SIGNALS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -106,6 +112,11 @@ class FleetRun:
         self._outcome = RunOutcome(use={agent_id: Use() for agent_id in config.ids})
         self._seen_dead: set[str] = set()
         self._flying_since_s: float | None = None
+        self._kill_by_s: float | None = None
+        """When the simulator is killed if it still runs; ``None``: nobody wants it to end."""
+        self._late: dict[int, tuple[int, int]] = {}
+        """Ticks and late ticks of each agent when the machine was looked at last."""
+        self._look_s = 0.0
 
     async def fly(self) -> RunOutcome:
         """Start everything, wait for the end of the simulated time or a signal, stop everything.
@@ -136,6 +147,11 @@ class FleetRun:
                 loop.remove_signal_handler(number)
 
     def _interrupt(self) -> None:
+        if self._outcome.interrupted:  # a second time: at once
+            for child in (self._simulator, *self._drivers, *self._daemons.values()):
+                child.kill()
+        if self._kill_by_s is None:
+            self._kill_by_s = time.monotonic() + SIMULATOR_GRACE_S
         self._outcome.interrupted = True
         self._stop.set()
         self._changed.set()
@@ -203,17 +219,40 @@ class FleetRun:
         """Until the simulator has ended; daemons that die are noted, the others fly on."""
         while self._simulator.running:
             self._note_deaths()
+            self._say_if_overloaded()
+            if not any(daemon.running for daemon in self._daemons.values()) and self._kill_by_s is None:
+                self._say("no daemon is left; ending the run")
+                self._kill_by_s = time.monotonic() + SIMULATOR_GRACE_S
+                self._stop.set()
             if self._stop.is_set() and not self._simulator.stopped_by_us:
                 self._simulator.terminate()
+            if self._kill_by_s is not None and time.monotonic() >= self._kill_by_s:
+                self._simulator.kill()
             await self._change(WATCH_S)
         self._note_use()
         self._note_deaths()
         code = await self._simulator.wait()
-        if code != 0:
+        if code != 0 and not (self._simulator.stopped_by_us and code < 0):
             exit_code = BAD_INPUT if code == BAD_INPUT else REFUSED
             raise RunFailed(f"simulator {self._simulator.why_it_ended()}", exit_code)
         await asyncio.sleep(LAST_TICKS_S)
         self._outcome.wall_s = time.monotonic() - (self._flying_since_s or time.monotonic())
+
+    def _say_if_overloaded(self) -> None:
+        """Once in a while: whose ticks have come late since the last look."""
+        if time.monotonic() < self._look_s:
+            return
+        self._look_s = time.monotonic() + SAID_EVERY_S
+        slow = []
+        for agent_id, observed in self._observer.agents.items():
+            counters = {} if observed.diagnostics is None else observed.diagnostics.counters
+            now = counters.get("ticks", 0), counters.get("ticks: late", 0)
+            ticks, late = (new - old for new, old in zip(now, self._late.get(agent_id, now), strict=True))
+            self._late[agent_id] = now
+            if ticks > 0 and late > LATE_SHARE * ticks:
+                slow.append(f"agent {agent_id} {100 * late / ticks:.0f} %")
+        if slow:
+            self._say(f"late ticks: {', '.join(slow)}; is the machine overloaded?")
 
     def _note_use(self) -> None:
         if self._flying_since_s is None:
@@ -277,7 +316,8 @@ class FleetRun:
         try:
             await self._observer.close()
         finally:
-            for name in await stop_all((self._simulator, *self._drivers, *self._daemons.values())):
+            grace_s = DAEMONS_GRACE_S if self._outcome.interrupted else GRACE_S
+            for name in await stop_all((self._simulator, *self._drivers, *self._daemons.values()), grace_s):
                 self._say(f"{name} did not end when asked and was killed; see its log in {self._out}")
 
 

@@ -24,9 +24,12 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
-from agent.log.estimate_log import SUFFIX
+from agent.errors import LogFileError
+from agent.log.estimate_log import SUFFIX, read_entries
 from fleetloc.errors import InputError
 
 CONFIG, TRUTH, REPORT_JSON, REPORT_HTML = "fleet.toml", "truth.npz", "report.json", "report.html"
@@ -72,6 +75,19 @@ def records(directory: Path, agent_id: int) -> list[Path]:
     last = record_path(directory, agent_id)
     earlier = itertools.takewhile(Path.exists, (_numbered(last, n) for n in itertools.count(1)))
     return [*earlier, *([last] if last.exists() else [])]
+
+
+def readable_entries(directory: Path, agent_id: int) -> tuple[list[NDArray[np.void]], list[str]]:
+    """The entries of an agent's records, the earliest first, and a line for each record that cannot be read."""
+    paths, parts, unread = records(directory, agent_id), [], []
+    if not paths:
+        unread.append(f"record {record_path(directory, agent_id)}: not there")
+    for path in paths:
+        try:
+            parts.append(read_entries(path)[1])
+        except LogFileError as error:  # of a daemon that was killed in its first moment
+            unread.append(str(error))
+    return parts, unread
 
 
 def in_folder(config: FleetConfig, base: Path, directory: Path) -> FleetConfig:

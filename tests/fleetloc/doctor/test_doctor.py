@@ -15,7 +15,7 @@ from agent.inputs import Served
 from agent.outputs import ToAutopilot
 from agent.sensing.frames import FleetFrame
 from fleetloc.cli import main
-from fleetloc.doctor.examination import Line, Mark, of_autopilot, of_computer
+from fleetloc.doctor.examination import Examined, Mark, of_autopilot, of_computer
 from fleetloc.doctor.listening import Listened, listen
 from sim_bridge.world.noise import FlavourName
 from sim_bridge.world.scenario import Scenario, Vehicle
@@ -64,7 +64,7 @@ def heard(
     return Listened(onboard, read)
 
 
-def by_name(lines: list[Line]) -> dict[str, Line]:
+def by_name(lines: list[Examined]) -> dict[str, Examined]:
     return {line.what: line for line in lines}
 
 

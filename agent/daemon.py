@@ -37,8 +37,9 @@ from agent.outputs import (
     Send,
     ToAutopilot,
 )
+from agent.radio.earlier_packets import EarlierPackets
 from agent.radio.radio import Listener, Radio
-from agent.radio.security import mavlink_signing, stamp_file
+from agent.radio.security import mavlink_signing, seen_file, stamp_file
 from agent.warmup import warm_up
 from agent.watch.diagnostics import (
     ProcessUse,
@@ -167,6 +168,11 @@ class Daemon:
             journal=None if self._record is None else self._record.flight,
         )
         self._observers = tuple(observers)
+        self._earlier: EarlierPackets | None = None
+        seen = seen_file(config, agent_id, base)
+        if seen is not None:
+            self._earlier = EarlierPackets(seen, config.fleet.name, lambda: self.onboard.opener.replay.state)
+            self._observers += (self._earlier,)
         if signing is not None:
             self._observers += (StampKeeper(signing, stamp_file(config, agent_id, base)),)
         self._ticks = TickTimes()
@@ -293,6 +299,8 @@ class Daemon:
     # --- radio ---------------------------------------------------------------------------------------------
 
     def _on_packet(self, key: str, data: bytes, arrived_s: float, unix_ns: int) -> None:
+        if self._earlier is not None and self._earlier.has(data):
+            return
         with self._faults.survived("taking a packet"):
             self.onboard.on_packet(key, data, arrived_s=arrived_s, host_s=time.monotonic(), unix_ns=unix_ns)
         self._advance()
@@ -433,6 +441,8 @@ class Daemon:
         counters["packets unsent"] += radio.pop("packets unsent")
         counters |= radio | {"program faults": self._faults.count}
         counters["diagnostics left out"] = self._left_out
+        if self._earlier is not None:
+            counters["rejected seen before the start"] = self._earlier.refused
         if self._record is not None:
             counters |= self._record.counters()
         gauges = gauges_of(onboard, now_s) | self._ticks.gauges() | self._use.gauges()

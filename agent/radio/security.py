@@ -260,6 +260,13 @@ def stamp_file(config: FleetConfig, agent_id: int, base: Path) -> StampFile:
     return StampFile(state_folder(config, base) / f"agent_{agent_id:03d}.stamps")
 
 
+def seen_file(config: FleetConfig, agent_id: int, base: Path) -> Path | None:
+    """Where it is kept which packets an agent has seen; ``None`` in fleets that do not sign."""
+    if config.security.mode != "signed":
+        return None
+    return state_folder(config, base) / f"agent_{agent_id:03d}.seen"
+
+
 def simulated_mavlink_keys(config: FleetConfig, base: Path) -> dict[int, bytes]:
     """The keys that simulated autopilots sign with, by agent; none for unsigned links. Raises `KeyFileError`."""
     folder = key_folder(config, base)

@@ -156,6 +156,8 @@ class _Sums:
         self, number: int, sizes: Sequence[_Size], ways: Matrix, least_nats: float
     ) -> dict[tuple[int, int], LikelyFault]:
         """The same of one unknown that makes all those of each, in some ``ways`` ``(m, k)``; by place and way."""
+        if not ways.size:  # of a drone with one pair there are no two to be swapped
+            return {}
         shape = len(self.begun), -1, self.profiles
         information = np.einsum("mi,bwpij,mj->bwmp", ways, self.information, ways).reshape(*shape, 1, 1)
         vector = np.einsum("mi,bwpi->bwmp", ways, self.vector).reshape(*shape, 1)

@@ -37,7 +37,7 @@ def flown(
     return monitor, changes[1:]
 
 
-@pytest.mark.parametrize("drones", [3, 4, 5])
+@pytest.mark.parametrize("drones", [2, 3, 4, 5])
 @pytest.mark.parametrize("calibrated", [True, False])
 def test_nobody_is_named_where_nobody_is_off(drones: int, calibrated: bool) -> None:
     for seed in range(2):
@@ -45,6 +45,14 @@ def test_nobody_is_named_where_nobody_is_off(drones: int, calibrated: bool) -> N
         assert changes == []
         assert monitor.unattributable_nats == 0.0
         assert monitor.receivers == drones
+
+
+def test_a_drone_alone_and_two_of_which_one_is_off_do_no_harm() -> None:
+    for drones in (1, 2):
+        monitor, changes = flown(drones, 1, 12.0, jump(0, np.array([20.0, 0.0, 0.0]), 5.0, 99.0))
+        assert changes == []
+        assert monitor.named == {}
+    assert monitor.unattributable_nats > 0.0
 
 
 @pytest.mark.parametrize(("rate_mps", "within_s"), [(5.0, 3.0), (0.5, 12.0), (0.1, 65.0)])

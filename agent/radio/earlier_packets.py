@@ -25,7 +25,7 @@ SAVE_EVERY_S = 10
 """A daemon that is killed forgets at most this much."""
 
 
-class _Kept(msgspec.Struct, frozen=True):
+class _SeenRecord(msgspec.Struct, frozen=True):
     sender: int
     kind: int
     boot: int
@@ -71,7 +71,7 @@ class EarlierPackets(Observer):
 
     async def _save(self) -> None:
         kept = [
-            _Kept(sender, int(kind), seen.boot, seen.newest, f"{seen.window:x}")
+            _SeenRecord(sender, int(kind), seen.boot, seen.newest, f"{seen.window:x}")
             for (sender, kind), seen in (self._before | self._state()).items()
         ]
         try:
@@ -85,7 +85,7 @@ def _read(path: Path) -> dict[StreamOf, Seen]:
         return {}
     check_mode(path, forbidden=OTHERS, remedy=f"chmod 600 {path}")
     try:
-        kept = msgspec.json.decode(read_text(path), type=list[_Kept])
+        kept = msgspec.json.decode(read_text(path), type=list[_SeenRecord])
         return {
             (each.sender, PacketKind(each.kind)): Seen(each.boot, each.newest, int(each.window, 16)) for each in kept
         }

@@ -29,6 +29,7 @@ from agent.outputs import (
     ClockStepped,
     CoreOutput,
     EstimateReady,
+    Faulted,
     LinkChanged,
     NotSent,
     Output,
@@ -314,7 +315,10 @@ class OnboardAgent:
         if isinstance(output, Tell):
             return self._sealed(output.message, self._unix_ns(host_s))
         if isinstance(output, EstimateReady) and self.feeder is not None:
-            return [output, *self._feed(output, self.feeder, host_s)]
+            try:
+                return [output, *self._feed(output, self.feeder, host_s)]
+            except Exception as fault:  # noqa: BLE001 - counted and told; the estimate is worth more than its feed
+                return [output, Faulted(fault, of_estimator=False)]
         return [output]
 
     def _feed(self, ready: EstimateReady, feeder: Feeder, host_s: float) -> list[Output]:

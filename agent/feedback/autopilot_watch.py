@@ -94,7 +94,8 @@ class AutopilotWatch:
         """Its GLOBAL_POSITION_INT of fleet time ``t_s``: is the origin still the one that it flies by?"""
         height_m = self._frame.height(message.alt * 1e-3, None)
         own = self.own_at(t_s)
-        if height_m is None or own is None or (message.lat == 0 and message.lon == 0):
+        nowhere = message.lat == 0 and message.lon == 0  # ArduPilot's, while it has no position
+        if height_m is None or own is None or nowhere or not _on_earth(message.lat, message.lon):
             return
         north, east, _ = self._frame.ned(message.lat * 1e-7, message.lon * 1e-7, height_m)
         self.apart_m = math.hypot(north - own[0], east - own[1])
@@ -127,6 +128,9 @@ class AutopilotWatch:
         if height_m is None:
             self.origin_fault = "sensors.geoid_separation_m is needed for its height"
             return
+        if not _on_earth(message.latitude, message.longitude):
+            self.origin_fault = "it is no place on earth"
+            return
         self.origin_fault = ""
         origin_m = self._frame.ned(message.latitude * 1e-7, message.longitude * 1e-7, height_m)
         if self.origin_m is not None and math.dist(origin_m, self.origin_m) > MOVED_M:
@@ -134,3 +138,7 @@ class AutopilotWatch:
         elif self.origin_m is not None:
             return
         self.origin_m = origin_m
+
+
+def _on_earth(lat_e7: int, lon_e7: int) -> bool:
+    return abs(lat_e7) <= 900_000_000 and abs(lon_e7) <= 1_800_000_000

@@ -6,6 +6,7 @@ PX4 1.16 (SIH) and ArduCopter 4.7 (SITL).
 
 from __future__ import annotations
 
+import math
 import struct
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -123,8 +124,10 @@ class ParameterReader:
         self._asked.clear()
 
     def on_value(self, message: Message, flavour: str) -> None:
-        """A PARAM_VALUE."""
-        self.values[parameter_name(message)] = parameter_value(message, flavour)
+        """A PARAM_VALUE; one that is no number says nothing."""
+        value = parameter_value(message, flavour)
+        if math.isfinite(value):
+            self.values[parameter_name(message)] = value
 
     def due(self, wanted: tuple[Requirement, ...], now_s: float) -> str | None:
         """The parameter to ask for now; one that is never answered is not there in this firmware."""

@@ -12,12 +12,14 @@ from agent.errors import ConfigError
 from agent.feedback.feeder import FedAutopilot, Feeder, Ready
 from agent.feedback.gatekeeper import FeedPhase
 from agent.mavlink.codec import Message, mavlink
+from agent.outputs import EstimateReady, Faulted
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AutopilotEstimate, GpsSample
 from estimators.estimator import Status
 from estimators.integrity.finding import What
 from estimators.integrity.protection.levels import ErrorEllipse, ProtectionLevel
 from estimators.integrity.protection.statement import IntegrityState, Statement
+from tests.support.onboard import onboard_of
 
 FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
 ORIGIN_M = (30.0, -20.0, 2.0)
@@ -170,6 +172,24 @@ def test_what_an_autopilot_does_not_read_it_is_not_given(flavour: str, kind: str
     assert f'feedback.kind = "{kind}" is for' in hover.feeder.verdict.reason
 
 
+def test_absurd_words_of_an_autopilot_are_survived_and_not_fed_by() -> None:
+    hover = Hover()
+    hover.go(4.0)
+    absurd = (
+        mavlink.MAVLink_param_value_message(b"EKF2_EV_CTRL", float("nan"), mavlink.MAV_PARAM_TYPE_REAL32, 1, 0),
+        mavlink.MAVLink_global_position_int_message(0, 2**31 - 1, -(2**31), 0, 0, 0, 0, 0, 0),
+        mavlink.MAVLink_estimator_status_message(0, 0xFFFF, *[float("nan")] * 8),
+        mavlink.MAVLink_statustext_message(0, b"\xff\xfe"),
+        mavlink.MAVLink_gps_global_origin_message(2**31 - 1, 2**31 - 1, 0),
+    )
+    for message in absurd:
+        hover.feeder.on_message(message, hover.now_s, hover.now_s)
+    hover.go(2.0, lost=True)
+
+    assert hover.kinds() == set()
+    assert "no place on earth" in hover.feeder.verdict.reason
+
+
 def test_a_wrong_parameter_is_said_while_gps_is_still_good() -> None:
     hover = Hover()
     asked = mavlink.MAVLink_param_value_message(b"EKF2_EV_CTRL", 0.0, mavlink.MAV_PARAM_TYPE_INT32, 1, 0)
@@ -255,3 +275,23 @@ def test_nobody_is_fed_unless_it_is_asked_for() -> None:
     assert not plain.feeds(1)
     assert config("odometry").feeds(1)
     assert config("gps_input").fed_receiver(1) == 1
+
+
+def test_a_fault_of_the_feed_costs_no_estimate() -> None:
+    onboard = onboard_of(config(), linked=True)
+    assert onboard.feeder is not None
+    onboard.feeder.on_estimate = raising  # type: ignore[method-assign]
+
+    outputs: list[Any] = []
+    for step in range(200):
+        outputs += onboard.advance(step * 0.05)
+
+    ready = [each for each in outputs if isinstance(each, EstimateReady)]
+    faults = [each for each in outputs if isinstance(each, Faulted)]
+    assert len(ready) > 50
+    assert len(faults) == len(ready)
+
+
+def raising(*_arguments: object) -> list[Message]:
+    """A feed that fails."""
+    raise ValueError("made up")

@@ -149,8 +149,9 @@ class FleetLockstep:
 
     def _come_and_go(self) -> None:
         events = self._around.events
+        time_s = self.queue.now_s - self._start_s + STEP_TOLERANCE_S  # which may come out a hair before the change
         for agent_id in self._config.ids:
-            is_there = events.is_there(agent_id, self.queue.now_s - self._start_s)
+            is_there = events.is_there(agent_id, time_s)
             if is_there and agent_id not in self.fleet.drones:
                 self.fleet.join(self._drone(agent_id))
             elif not is_there and agent_id in self.fleet.drones:

@@ -90,6 +90,13 @@ class Flight:
         return float(np.sqrt(ready.estimate.covariance.diagonal()[own][:3].min()))
 
 
+@pytest.mark.parametrize("back_s", [0.9490488, 1.0494905, 1.1000001, 0.9500001])
+def test_whoever_is_away_comes_back_at_whatever_instant(back_s: float) -> None:
+    # GIVEN instants that a clock with a start of 1000 s cannot show
+    flight = Flight("line3.toml", 2.0, FleetEvents(away=(Interval(2, 0.5, back_s),)))
+    assert flight.between(2, back_s, 2.0)
+
+
 # --- join, crash, come back --------------------------------------------------------------------------------
 
 CHANGES = FleetEvents(away=(Interval(3, 0.0, 3.0), Interval(2, 6.0, 12.0)))

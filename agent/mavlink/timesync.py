@@ -18,6 +18,8 @@ FAST_PERIOD_S, SLOW_PERIOD_S = 0.1, 1.0
 FAST_FOR_S = 10.0
 MAX_PENDING = 32
 MAX_DRIFT = 0.05
+GUESSES = 10
+"""Of a boot time: each is `MAX_DRIFT` times as far off as the one before at most, the first by the clocks' offset."""
 JUMP_S = 0.1
 JUMPS_TO_RESET = 5
 MIN_FIT_SPAN_S = 2.0
@@ -107,7 +109,7 @@ class BootClock:
     def boot_s(self, host_s: float) -> float | None:
         """Boot time of a host time; ``None`` before anything was heard."""
         boot_s = host_s
-        for _ in range(2):  # the drift between the two clocks makes the second guess exact to a microsecond
+        for _ in range(GUESSES):
             at_s = self.host_s(boot_s)
             if at_s is None:
                 return None

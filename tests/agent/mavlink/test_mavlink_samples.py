@@ -380,3 +380,13 @@ def test_after_a_reboot_its_last_word_on_that_is_forgotten() -> None:
     made.reset()
     attitude = mavlink.MAVLink_attitude_quaternion_message(99_990, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     assert convert(made, attitude).aided
+
+
+def test_what_we_gave_the_autopilot_as_a_receiver_is_no_measurement() -> None:
+    made = SampleAdapter(
+        FRAME, SensorsTable(), EPOCH_UNIX_S, lambda boot_s, _: boot_s + BOOT_OFFSET_S, own_receiver=1
+    )
+
+    assert convert(made, gps2()) is None
+    assert made.skipped["gps: given by us"] == 1
+    assert convert(made, gps()) is not None

@@ -101,3 +101,17 @@ def test_after_a_reset_nothing_of_the_old_clock_is_left() -> None:
     clock.reset()
     assert clock.host_s(10.0) is None
     assert clock.rtt_s is None
+
+
+@pytest.mark.parametrize("drift", [0.0, 3e-3, -2e-2])
+def test_boot_times_of_host_times_are_the_way_back(drift: float) -> None:
+    clock, autopilot = BootClock(), VirtualAutopilot(40.0, drift)
+    assert clock.boot_s(100.0) is None
+    for step in range(2000):
+        autopilot.exchange(clock, 100.0 + 0.01 * step, 0.001, 0.001)
+
+    for host_s in (115.0, 119.5, 120.3):
+        boot_s = clock.boot_s(host_s)
+        assert boot_s is not None
+        assert clock.host_s(boot_s) == pytest.approx(host_s, abs=1e-5)
+        assert boot_s == pytest.approx(autopilot.time_s(host_s), abs=2e-3)

@@ -20,7 +20,7 @@ from dataclasses import replace
 import numpy as np
 
 from estimators.algorithms.rival import Passages, Rival, log_likelihood, merged, placed
-from estimators.algorithms.shared_monitors import Belief, SharedMonitors, Verdict
+from estimators.algorithms.shared_monitors import Belief, SharedMonitors, Verdict, loosened
 from estimators.consensus.inheritance import Inheritance
 from estimators.estimator import Estimate, Payload, SolverReport, Status
 from estimators.integrity.finding import Finding, What
@@ -35,6 +35,7 @@ from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.settings import EstimatorSettings
 from estimators.solvers.qp import make_engine
+from estimators.systematic.acceleration_errors import AccelerationErrors
 from estimators.systematic.belief import SlowBelief
 from estimators.systematic.range_biases import RangeBiases
 from estimators.systematic.sizes import SystematicSizes
@@ -146,7 +147,7 @@ class SharedMovingHorizonEstimator:
         contradictions = self._contradictions(problem, solution)
         states = self.belief.states
         covariance = symmetrised(solution.covariance[:states, :states])
-        belief = Belief(solution.path, covariance, solution.arrival.kinematic())
+        belief = Belief(solution.path, covariance, solution.arrival.kinematic(), self._acceleration_errors(solution))
         rows, measured = self._seen(problem, solution)
         verdict = self._monitors.look(rows, measured, belief, (before, self._rival), slide=self.window.full)
         observable = verdict.observable
@@ -161,6 +162,8 @@ class SharedMovingHorizonEstimator:
             self._last = self._rival = None
         elif self._rival is None:
             self._rival = self._other_place(problem, solution, verdict)
+        for slot, moment in verdict.found_again.items():
+            self.belief, self._states = loosened(self.belief, slot, moment), None
         return Estimate(
             self.window.last,
             verdict.belief.path[-1],
@@ -175,6 +178,11 @@ class SharedMovingHorizonEstimator:
             self._innovations.averages(),
             self._range_biases(solution),
         )
+
+    def _acceleration_errors(self, solution: SlowSolution) -> AccelerationErrors | None:
+        if self._sizes is None:
+            return None
+        return AccelerationErrors.of(solution.slow, solution.covariance, self.belief.sizes, self.period_s)
 
     def _range_biases(self, solution: SlowSolution) -> RangeBiases | None:
         if self._sizes is None:
@@ -210,7 +218,7 @@ class SharedMovingHorizonEstimator:
 
     def _other_place(self, problem: SlowProblem, solution: SlowSolution, verdict: Verdict) -> Rival | None:
         """The place that a drone may be at instead: its mirror image, or where its data hold to."""
-        located = np.flatnonzero(verdict.observable).tolist()
+        located = np.flatnonzero(verdict.held).tolist()
         mirrored = self._passages.rival(problem.rows, solution.arrival, located) if self.window.full else None
         if mirrored is not None and self._is_possible(mirrored):
             return mirrored

@@ -10,7 +10,7 @@ weighed against the estimate's (`estimators.algorithms.rival`), or a fleet mirro
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,7 @@ from estimators.integrity.places.ambiguity import (
     Body,
     DroneEvidence,
     Elsewhere,
+    FoundAgain,
     Understated,
     body_of,
     rows_of,
@@ -36,6 +37,9 @@ from estimators.model.measurements import Matrix, RowTable, Vector, empty_rows
 from estimators.model.members import InformationState, MemberChange
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import POSITION, any_of
+from estimators.systematic.acceleration_errors import AccelerationErrors
+from estimators.systematic.belief import SlowBelief
+from estimators.systematic.slow_errors import acceleration_of
 from estimators.window.problem import WindowProblem
 
 RESEATED_SPREAD = 2.0
@@ -54,6 +58,15 @@ class Belief:
     """``(6n, 6n)`` of the newest one."""
     arrival: InformationState
     """The arrival cost of the next window."""
+    errors: AccelerationErrors | None = None
+    """Of the newest accelerations, where they are estimated."""
+
+    def followed(self, slot: int, lag: int = 0) -> Body:
+        """An agent's state some ticks ago, with the error of its acceleration where that is estimated."""
+        mean = self.path[-1 - lag]
+        if self.errors is None:
+            return body_of(mean, self.covariance, slot)
+        return self.errors.joined(mean, self.covariance, slot)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,10 +76,15 @@ class Verdict:
     belief: Belief
     observable: NDArray[np.bool_]
     """``(n,)`` whose place the data tell."""
+    held: NDArray[np.bool_]
+    """``(n,)``: of these, who has fixes, or hangs on those who have."""
     moves: int
     """How often the belief was moved to where the data hold."""
     elsewhere: tuple[int, Body] | None = None
     """A drone whose data hold to another place, and its state there at the first tick of the next window."""
+    found_again: Mapping[int, Matrix] = field(default_factory=dict)
+    """By slot, of drones that have a fix again: what the covariance of their states at the first tick of the next
+    window, with the error of the acceleration where that is estimated, should be at least."""
 
 
 class SharedMonitors:
@@ -105,8 +123,8 @@ class SharedMonitors:
     ) -> Verdict:
         """Weigh a solved window; ``measured`` are its rows with the sensors' own variances.
 
-        ``rivals``: that of the tick before, and the one that is left of it. A drone that has one is left to it: it
-        weighs two places with all that the estimator holds.
+        ``rivals``: that of the tick before, and the one that is left of it. A drone that has one is left to it, where
+        there are two places at most: it weighs them with all that the estimator holds.
 
         ``slide``: whether the arrival cost is that of a window that starts one tick later.
         """
@@ -118,20 +136,25 @@ class SharedMonitors:
         if has(mirror, What.REVERSED):
             belief, moves = _reversed(belief), 1
         covariance, elsewhere = belief.covariance, None
+        found_again: dict[int, Matrix] = {}
         before, rival = rivals
-        located = observable & ~self._doubtful
+        located = self._held(problem.rows, observable & ~self._doubtful)
         self._doubtful = np.zeros(len(observable), np.bool_)
         for slot, monitor in enumerate(self._ambiguities):
             lag = 0 if slot == self._slot else HEARSAY_TICKS
             if lag >= len(problem.accel):
                 continue
-            if before is not None and before.slot == slot:
-                monitor.restart(body_of(belief.path[-1 - lag], belief.covariance, slot))
+            if before is not None and before.slot == slot and monitor.leaves_two_places(located):
+                monitor.restart(belief.followed(slot, lag))
                 continue
             for finding in monitor.observe(self._evidence(slot, lag, problem, measured, belief, located)):
                 match finding:
+                    case FoundAgain():
+                        covariance = widened(covariance, finding.second_moment[:6, :6], slot)
+                        found_again[slot] = finding.second_moment
+                        self._doubtful[slot] = True
                     case Understated():
-                        covariance = widened(covariance, finding.second_moment, slot)
+                        covariance = widened(covariance, finding.second_moment[:6, :6], slot)
                     case Elsewhere():
                         elsewhere = slot, self._carried_back(slot, lag, finding.place, problem, slide=slide)
                     case _:
@@ -145,7 +168,17 @@ class SharedMonitors:
             if isinstance(finding, MirrorImage):
                 observable &= ~finding.doubtful(covariance)
                 covariance = finding.covered(covariance)
-        return Verdict(replace(belief, covariance=covariance), observable, moves, elsewhere)
+        belief = replace(belief, covariance=covariance)
+        return Verdict(belief, observable, located & observable, moves, elsewhere, found_again)
+
+    def _held(self, rows: RowTable, trusted: NDArray[np.bool_]) -> NDArray[np.bool_]:
+        """Who of the ``trusted`` ``(n,)`` has fixes, or hangs on those who have, be it over others."""
+        held = trusted & np.array([any_of(rows, POSITION, slot) for slot in range(len(trusted))])
+        while True:
+            more = trusted & (held | np.array([monitor.is_held(held) for monitor in self._ambiguities]))
+            if (more == held).all():
+                return np.asarray(held, np.bool_)
+            held = more
 
     def _window(self, problem: WindowProblem, belief: Belief, *, slide: bool) -> WindowEvidence:
         """What the monitors of the whole fleet look at."""
@@ -172,6 +205,7 @@ class SharedMonitors:
     ) -> DroneEvidence:
         """What speaks of a drone ``lag`` ticks ago; the others are where the estimate has them."""
         mean, covariance = belief.path[-1 - lag], belief.covariance
+        drift = None if belief.errors is None else belief.errors.drift(slot)
         fixed = any_of(problem.rows, POSITION, slot)
         mine = slice(3 * slot, 3 * slot + 3)
         start = problem.start
@@ -180,11 +214,12 @@ class SharedMonitors:
         return DroneEvidence(
             fixed,
             slot == self._slot or bool((problem.rows["observer"] == slot).any()),
-            body_of(mean, covariance, slot),
+            belief.followed(slot, lag),
             rows,
             problem.accel[-1 - lag, mine],
             problem.accel_variance[-1 - lag, mine],
             {other: body_of(mean, covariance, other) for other in others},
+            drift,
         )
 
     def _carried_back(self, slot: int, lag: int, there: Body, problem: WindowProblem, *, slide: bool) -> Body:
@@ -220,9 +255,28 @@ def widened(covariance: Matrix, moment: Matrix, slot: int) -> Matrix:
     Only what is missing is added: the errors that the agent shares with the others stay shared.
     """
     out, own = covariance.copy(), block(slot)
-    values, axes = np.linalg.eigh(moment - covariance[own, own])
-    out[own, own] += (axes * np.maximum(values, 0.0)) @ axes.T
+    out[own, own] += lacking(moment, covariance[own, own])
     return out
+
+
+def lacking(moment: Matrix, covariance: Matrix) -> Matrix:
+    """What is to be added to a covariance for it to be at least ``moment`` along every direction."""
+    values, axes = np.linalg.eigh(moment - covariance)
+    return np.asarray((axes * np.maximum(values, 0.0)) @ axes.T, np.float64)
+
+
+def loosened(belief: SlowBelief, slot: int, moment: Matrix) -> SlowBelief:
+    """A belief whose covariance of an agent's state, with the error of its acceleration, is at least ``moment``.
+
+    ``moment`` ``(6, 6)``, or ``(9, 9)`` with the error.
+    """
+    at = np.arange(block(slot).start, block(slot).stop)
+    if len(moment) > len(at):
+        error = acceleration_of(slot, belief.states // STATES_PER_AGENT)
+        at = np.concatenate((at, belief.states + np.arange(error.start, error.stop)))
+    grid, covariance = np.ix_(at, at), belief.covariance.copy()
+    covariance[grid] += lacking(moment, covariance[grid])
+    return replace(belief, covariance=covariance)
 
 
 def understated(covered: Matrix, covariance: Matrix) -> NDArray[np.bool_]:
@@ -237,4 +291,5 @@ def _reversed(belief: Belief) -> Belief:
     """The mirror image of a belief."""
     _, covariance = mirrored(belief.path[-1], belief.covariance)
     arrival = InformationState.from_moments(*mirrored(belief.arrival.mean, belief.arrival.covariance()))
-    return Belief(np.array([state + mirror_offset(state) for state in belief.path]), covariance, arrival)
+    path = np.array([state + mirror_offset(state) for state in belief.path])
+    return Belief(path, covariance, arrival, None if belief.errors is None else belief.errors.apart())

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.places.hypotheses import (
+    Drift,
     Mixture,
     correct_linear,
     correct_range,
@@ -48,7 +49,7 @@ from estimators.integrity.thresholds import (
     UNDERSTATED,
     WEAK_M,
 )
-from estimators.model.layout import block
+from estimators.model.layout import STATES_PER_AGENT, block
 from estimators.model.limits import StateLimits
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 from estimators.model.members import MemberChange
@@ -58,8 +59,14 @@ SCATTERED_FRACTION = 0.3
 SAGITTA = 1.5
 """Sagitta over one sigma of a hypothesis, in sigmas of the range, from which on the hypothesis is split."""
 
+LASTING_S = 2.0
+"""How long the error of a body's place lasts where one or two bodies hold a drone: ranges that are all off in one way
+then tell where it is about them. White noise of a variance 2 t s over the period has the effect of an error of
+variance s that lasts for t."""
+
 Body = tuple[Vector, Matrix]
-"""Mean ``(6,)`` and covariance ``(6, 6)`` of one agent, NED m and m/s."""
+"""Mean ``(6,)`` and covariance ``(6, 6)`` of one agent, NED m and m/s; with the error of its acceleration, m/s2,
+where that is followed, ``(9,)`` and ``(9, 9)``."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +87,8 @@ class DroneEvidence:
     """``(3,)``, (m/s2)2."""
     others: Mapping[int, Body]
     """The drones that are located, by slot, where the estimate has them."""
+    drift: Drift | None = None
+    """How the error of its acceleration lasts; with it the estimate has nine states."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -87,7 +96,12 @@ class Understated(Finding):
     """The estimate's covariance is too small; ``value`` is the expected error in m, ``limit`` the claimed one."""
 
     second_moment: Matrix
-    """E[(x - estimate)(x - estimate)'] ``(6, 6)``, over all hypotheses: what the covariance should be."""
+    """E[(x - estimate)(x - estimate)'] of its states, over all hypotheses: what the covariance should be."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class FoundAgain(Understated):
+    """The drone has a fix again, which the estimate would not believe."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True, eq=False)
@@ -121,6 +135,8 @@ class AmbiguityMonitor:
         """None while the drone has fixes, and before it is heard."""
         self._estimate = prior
         """As of the last tick."""
+        self._drift: Drift | None = None
+        """Likewise."""
         self._blind_ticks = BLIND_TICKS
         self._tick = 0
         self._places: dict[tuple[float, ...] | int, tuple[int, Vector]] = {}
@@ -130,13 +146,15 @@ class AmbiguityMonitor:
     def observe(self, evidence: DroneEvidence) -> tuple[Finding, ...]:
         """Whether the place is ambiguous, the covariance too small (`Understated`), the drone `Elsewhere`."""
         before, self._estimate = self._estimate, evidence.estimate
+        if evidence.drift is not None and len(before[0]) == STATES_PER_AGENT:
+            before = _drifting(before, evidence.drift)
         self._tick += 1
         if not evidence.fixed and not evidence.heard and self._mixture is None:
             return ()
         self._blind_ticks = 0 if evidence.fixed else self._blind_ticks + 1
         if self._blind_ticks < BLIND_TICKS:
-            self._mixture = None
-            return ()
+            mixture, self._mixture = self._mixture, None
+            return () if mixture is None else self._found_again(mixture, before)
         mixture = Mixture.single(*before) if self._mixture is None else self._mixture
         self._advance(mixture, evidence)
         mixture = self._corrected(mixture, evidence)
@@ -144,6 +162,31 @@ class AmbiguityMonitor:
             mixture = Mixture.single(*evidence.estimate)
         self._mixture = mixture
         return self._judged(mixture, evidence)
+
+    def _found_again(self, mixture: Mixture, estimate: Body) -> tuple[Finding, ...]:
+        """With the first fix: what the estimate that it meets should have been taken for."""
+        moment = mixture.second_moment(estimate[0])
+        expected, claimed = float(np.trace(moment[:3, :3])), float(np.trace(estimate[1][:3, :3]))
+        if expected <= OVERSTATED * claimed:
+            return ()
+        figures = (self._slot, float(np.sqrt(expected)), float(np.sqrt(claimed)))
+        return (FoundAgain(What.UNDERSTATED, Gravity.NOTED, *figures, second_moment=moment),)
+
+    def is_held(self, located: NDArray[np.bool_]) -> bool:
+        """Whether the drone has fixes, or ranges to drones of ``located`` ``(n,)`` and to anchors determine it.
+
+        Who is held so is one that others may be located by. Drones without fixes that hold only each other turn
+        together about those that they hang on, and none of them is told by the others that it does.
+        """
+        return self._blind_ticks < BLIND_TICKS or determined(self._estimate[0][:3], self._ranged(located))
+
+    def leaves_two_places(self, located: NDArray[np.bool_]) -> bool:
+        """Whether there are enough of ``located`` ``(n,)`` and anchors for a place and its mirror image at most."""
+        return len(self._ranged(located)) >= DIRECTIONS
+
+    def _ranged(self, located: NDArray[np.bool_]) -> list[Vector]:
+        """Where those are that ranges went to lately."""
+        return [place for key, (_, place) in self._places.items() if not isinstance(key, int) or located[key]]
 
     def restart(self, estimate: Body) -> None:
         """Go on from an estimate of this tick, whose other places somebody else holds."""
@@ -155,7 +198,7 @@ class AmbiguityMonitor:
         """Give up hypotheses that are beyond the limits; False where none is left."""
         if self._limits is None:
             return True
-        allowed = self._limits.allow(self._slot, mixture.means, mixture.covariances)
+        allowed = self._limits.allow(self._slot, mixture.means[:, :6], mixture.covariances[:, :6, :6])
         if allowed.any() and not allowed.all():
             mixture.log_weights, mixture.means = mixture.log_weights[allowed], mixture.means[allowed]
             mixture.covariances = mixture.covariances[allowed]
@@ -175,7 +218,11 @@ class AmbiguityMonitor:
         """Move to this tick and use its rows other than ranges."""
         rows = evidence.rows
         linear = rows[(rows["kind"] == Kind.POSITION) | (rows["kind"] == Kind.VELOCITY)]
-        predict(mixture, evidence.accel, evidence.accel_variance, self._period_s)
+        before, self._drift = self._drift, evidence.drift
+        predict(mixture, evidence.accel, evidence.accel_variance, self._period_s, evidence.drift)
+        if before is not None and evidence.drift is not None:  # an attitude that tilts does so at once
+            grown = np.maximum(evidence.drift.size_mps2**2 - before.size_mps2**2, 0.0)
+            mixture.covariances[:, range(6, 9), range(6, 9)] += grown
         for row in linear[np.argsort(linear["value"], kind="stable")]:
             correct_linear(mixture, _slope(row), float(row["value"]), float(row["variance"]))
 
@@ -190,14 +237,16 @@ class AmbiguityMonitor:
             return mixture
         nearest = usable[0]
         others = [each.place[:3] - nearest.place[:3] for each in usable if each.target != nearest.target]
-        forward = others[0] if others else mixture.means[0, 3:]
+        forward = others[0] if others else mixture.means[0, 3:6]
         if len(mixture.log_weights) == 1 and _sigma(mixture.covariances[0]) > SCATTERED_FRACTION * nearest.range_m:
             mixture = _scattered(mixture, nearest, forward)
             usable = usable[1:]
         sigma_m = float(np.sqrt(nearest.variance + _sigma(nearest.spread) ** 2))
         split(mixture, nearest.place[:3], float(np.sqrt(2.0 * SAGITTA * nearest.range_m * sigma_m)), forward)
+        lasting = 2.0 * LASTING_S / self._period_s - 1.0 if len(self._places) < DIRECTIONS else 0.0
         for each in usable:
-            correct_range(mixture, each.place, each.spread, each.range_m, each.variance, each.offset_s)
+            variance = each.variance + lasting * float(np.trace(each.spread[:3, :3])) / 3.0
+            correct_range(mixture, each.place, each.spread, each.range_m, variance, each.offset_s)
         return mixture
 
     def _judged(self, mixture: Mixture, evidence: DroneEvidence) -> tuple[Finding, ...]:
@@ -261,7 +310,7 @@ class AmbiguityMonitor:
 def _scattered(mixture: Mixture, nearest: _Ranged, forward: Vector) -> Mixture:
     """The one component cut to patches about the nearest neighbour."""
     variance = nearest.variance + _sigma(nearest.spread) ** 2
-    centre = nearest.place[:3] + nearest.offset_s * (nearest.place[3:] - mixture.means[0, 3:])
+    centre = nearest.place[:3] + nearest.offset_s * (nearest.place[3:] - mixture.means[0, 3:6])
     return on_sphere(mixture.means[0], mixture.covariances[0], centre, nearest.range_m, variance, forward)
 
 
@@ -296,15 +345,22 @@ def _decided(mixture: Mixture, estimate: Body, bodies: tuple[Matrix, Matrix]) ->
         mixture.log_weights[here] = np.maximum(mixture.log_weights[here], top - DECISIVE_NATS)
         return None
     mixture.log_weights[here] = -np.inf
-    return place.copy(), spread.copy()
+    return place[:6].copy(), spread[:6, :6].copy()
 
 
 def _apart(mixture: Mixture, estimate: Body) -> NDArray[np.bool_]:
     """Which components ``(K,)`` and an estimate of the position cannot both be right."""
-    away = (mixture.means - estimate[0])[:, :3]
-    both = (mixture.covariances + estimate[1])[:, :3, :3]
+    away = mixture.means[:, :3] - estimate[0][:3]
+    both = mixture.covariances[:, :3, :3] + estimate[1][:3, :3]
     square = np.einsum("ki,ki->k", away, np.linalg.solve(both, away[:, :, None])[:, :, 0])
     return np.asarray(square > DISAGREEMENT_SQUARE)
+
+
+def _drifting(body: Body, drift: Drift) -> Body:
+    """A state ``(6,)`` with an error of its acceleration of which nothing is known yet."""
+    covariance = np.zeros((9, 9))
+    covariance[:6, :6], covariance[6:, 6:] = body[1], np.diag(drift.size_mps2**2)
+    return np.concatenate((body[0], np.zeros(3))), covariance
 
 
 def rows_of(rows: RowTable, slot: int) -> RowTable:

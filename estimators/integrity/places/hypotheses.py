@@ -5,6 +5,9 @@ point and its mirror image in the plane of the neighbours: a single Gaussian lin
 that. Each component here is a second-order extended Kalman filter over the six states, its weight the likelihood
 of what was measured (Gaussian sum filter; Alspach and Sorenson, IEEE TAC 1972). All components are corrected at
 once, as arrays. NED, m and m/s.
+
+Where the error of the drone's acceleration lasts (`Drift`), it is three more states, m/s2: which error it would
+have to be differs from place to place, and white noise of its size would tell places apart that are not.
 """
 
 from __future__ import annotations
@@ -21,7 +24,7 @@ PRUNED_NATS = 14.0
 """Components less likely than the likeliest by more than this (a factor of 1.2e6) are given up; what decides between
 two places (`estimators.integrity.thresholds.DECISIVE_NATS`) is less, so that nothing dies undecided."""
 MERGED_SQUARE = 2.0
-"""Squared Mahalanobis distance over the six states below which two components say the same; the parts of a split
+"""Squared Mahalanobis distance over all states below which two components say the same; the parts of a split
 are 9 apart."""
 MOST = 128
 """Components at most: nothing is split beyond it."""
@@ -38,9 +41,9 @@ class Mixture:
     log_weights: Vector
     """``(K,)``."""
     means: Matrix
-    """``(K, 6)``."""
+    """``(K, 6)``, or ``(K, 9)`` with the error of the acceleration."""
     covariances: Matrix
-    """``(K, 6, 6)``."""
+    """``(K, 6, 6)`` or ``(K, 9, 9)``."""
 
     @classmethod
     def single(cls, mean: Vector, covariance: Matrix) -> Mixture:
@@ -64,27 +67,49 @@ class Mixture:
         return np.asarray(scaled / scaled.sum(), np.float64)
 
     def likeliest(self) -> tuple[float, Vector, Matrix]:
-        """Weight, mean ``(6,)`` and covariance ``(6, 6)`` of the likeliest component."""
+        """Weight, mean and covariance of the likeliest component."""
         best = int(np.argmax(self.log_weights))
         return float(self.weights[best]), self.means[best], self.covariances[best]
 
     def second_moment(self, about: Vector) -> Matrix:
-        """E[(x - about)(x - about)'] ``(6, 6)``: how wrong an estimate ``about`` ``(6,)`` may be."""
+        """E[(x - about)(x - about)']: how wrong an estimate ``about`` of all states may be."""
         away = self.means - about
         each = self.covariances + away[:, :, None] * away[:, None, :]
         return np.asarray(np.einsum("k,kij->ij", self.weights, each), np.float64)
 
 
-def predict(mixture: Mixture, accel: Vector, accel_variance: Vector, period_s: float) -> None:
-    """Move all components over a tick with an acceleration ``(3,)`` in m/s2 and its variances."""
-    transition, push = transition_matrix(1, period_s), input_matrix(1, period_s)
+@dataclass(frozen=True, slots=True)
+class Drift:
+    """How the lasting error of an acceleration goes on: a Gauss-Markov process."""
+
+    kept: float
+    """Factor per tick, 0..1."""
+    size_mps2: Vector
+    """``(3,)`` standard deviations."""
+
+
+def predict(
+    mixture: Mixture, accel: Vector, accel_variance: Vector, period_s: float, drift: Drift | None = None
+) -> None:
+    """Move all components over a tick with an acceleration ``(3,)`` in m/s2 and its variances.
+
+    ``drift``: how its error goes on, where that is a state.
+    """
+    kinematic = input_matrix(1, period_s)
+    if drift is None:
+        transition, push, noise = transition_matrix(1, period_s), kinematic, np.zeros((6, 6))
+    else:
+        transition, push, noise = drift.kept * np.eye(9), np.zeros((9, 3)), np.zeros((9, 9))
+        transition[:6, :6], transition[:6, 6:], push[:6] = transition_matrix(1, period_s), -kinematic, kinematic
+        noise[range(6, 9), range(6, 9)] = (1.0 - drift.kept**2) * drift.size_mps2**2
     mixture.means = mixture.means @ transition.T + push @ accel
-    noise = (push * accel_variance) @ push.T
+    noise += (push * accel_variance) @ push.T
     mixture.covariances = transition @ mixture.covariances @ transition.T + noise
 
 
 def correct_linear(mixture: Mixture, slope: Vector, value: float, variance: float) -> None:
-    """Correct with a scalar ``slope . x`` + noise."""
+    """Correct with a scalar ``slope . x`` + noise; ``slope`` ``(6,)``, the error of an acceleration has none."""
+    slope = np.pad(slope, (0, mixture.means.shape[1] - len(slope)))
     innovation = value - mixture.means @ slope
     gain = mixture.covariances @ slope
     _update(mixture, gain, gain @ slope + variance, innovation)
@@ -98,7 +123,7 @@ def correct_range(
     Second order: the mean and the variance of what the linearisation misses are in the innovation.
     """
     lever = np.array([1.0, 1.0, 1.0, offset_s, offset_s, offset_s])
-    means, spread = mixture.means * lever, mixture.covariances * np.outer(lever, lever)
+    means, spread = mixture.means[:, :6] * lever, mixture.covariances[:, :6, :6] * np.outer(lever, lever)
     there, there_spread = place * lever, place_covariance * np.outer(lever, lever)
     own = spread[:, :3, :3] + spread[:, 3:, :3] + spread[:, :3, 3:] + spread[:, 3:, 3:]
     other = there_spread[:3, :3] + there_spread[3:, :3] + there_spread[:3, 3:] + there_spread[3:, 3:]
@@ -109,14 +134,14 @@ def correct_range(
     predicted = distance + 0.5 * np.einsum("kii->k", bent)
     missed = 0.5 * np.einsum("kij,kji->k", bent, bent)
     slope = np.concatenate([unit, offset_s * unit], axis=-1)
-    gain = np.einsum("kij,kj->ki", mixture.covariances, slope)
+    gain = np.einsum("kij,kj->ki", mixture.covariances[:, :, :6], slope)
     known = np.einsum("ki,ij,kj->k", unit, other, unit)
-    total = np.einsum("ki,ki->k", slope, gain) + known + missed + variance
+    total = np.einsum("ki,ki->k", slope, gain[:, :6]) + known + missed + variance
     _update(mixture, gain, total, value_m - predicted)
 
 
 def _update(mixture: Mixture, gain: Matrix, variance: Vector, innovation: Vector) -> None:
-    """Kalman update with unscaled gains ``(K, 6)``, innovation variances and innovations ``(K,)``."""
+    """Kalman update with unscaled gains ``(K, D)``, innovation variances and innovations ``(K,)``."""
     mixture.log_weights = mixture.log_weights - 0.5 * (innovation**2 / variance + np.log(variance))
     mixture.means = mixture.means + gain * (innovation / variance)[:, None]
     reduced = mixture.covariances - gain[:, :, None] * gain[:, None, :] / variance[:, None, None]

@@ -49,7 +49,7 @@ def hold_both_sides(mixture: Mixture, places: Matrix, velocities: Matrix) -> Non
 def _add_images(mixture: Mixture, places: Matrix, velocities: Matrix, normal: Vector) -> None:
     """Hold the image of every component at least as likely as the component's own covariance left it."""
     images = mirrored_states(mixture.means, places, velocities)
-    turn = _turn(normal)
+    turn = _turn(normal, mixture.means.shape[1])
     spreads = turn @ mixture.covariances @ turn
     away = images - mixture.means
     lead_nats = 0.5 * CREDIT * np.einsum("ki,ki->k", away, _solved(mixture.covariances, away))
@@ -66,8 +66,8 @@ def _add_images(mixture: Mixture, places: Matrix, velocities: Matrix, normal: Ve
 
 
 def image_of(mean: Vector, covariance: Matrix, places: Matrix, velocities: Matrix) -> tuple[Vector, Matrix]:
-    """The image ``(6,)``, ``(6, 6)`` of one hypothesis; arguments as in `hold_both_sides`."""
-    turn = mirror(places)
+    """The image of one hypothesis, with as many states; arguments as in `hold_both_sides`."""
+    turn = _turn(_normal(places), len(mean))
     return mirrored_states(mean[None], places, velocities)[0], turn @ covariance @ turn
 
 
@@ -76,15 +76,16 @@ def mirror(places: Matrix) -> Matrix:
     return _turn(_normal(places))
 
 
-def _turn(normal: Vector) -> Matrix:
-    return np.asarray(np.kron(np.eye(2), np.eye(3) - 2.0 * np.outer(normal, normal)), np.float64)
+def _turn(normal: Vector, states: int = 6) -> Matrix:
+    return np.asarray(np.kron(np.eye(states // 3), np.eye(3) - 2.0 * np.outer(normal, normal)), np.float64)
 
 
 def mirrored_states(states: Matrix, places: Matrix, velocities: Matrix) -> Matrix:
-    """The images ``(k, 6)`` of states in the plane that bodies are nearest to, and move on with."""
+    """The images of states ``(k, 6)``, or 9, in the plane that bodies are nearest to, and move on with."""
     now = _mirrored(states[:, :3], places)
-    later = _mirrored(states[:, :3] + LOOK_AHEAD_S * states[:, 3:], places + LOOK_AHEAD_S * velocities)
-    return np.concatenate([now, (later - now) / LOOK_AHEAD_S], axis=-1)
+    later = _mirrored(states[:, :3] + LOOK_AHEAD_S * states[:, 3:6], places + LOOK_AHEAD_S * velocities)
+    turn = _turn(_normal(places), states.shape[1])[6:, 6:]
+    return np.concatenate([now, (later - now) / LOOK_AHEAD_S, states[:, 6:] @ turn], axis=-1)
 
 
 def _mirrored(points: Matrix, places: Matrix) -> Matrix:
@@ -105,5 +106,5 @@ def _normal(places: Matrix) -> Vector:
 
 
 def _solved(covariances: Matrix, vectors: Matrix) -> Matrix:
-    """P^-1 v ``(k, 6)`` of covariances ``(k, 6, 6)``."""
+    """P^-1 v ``(k, D)`` of covariances ``(k, D, D)``."""
     return np.asarray(np.linalg.solve(covariances, vectors[:, :, None])[:, :, 0], np.float64)

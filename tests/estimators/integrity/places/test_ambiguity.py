@@ -13,10 +13,11 @@ from estimators.integrity.places.ambiguity import (
     Body,
     DroneEvidence,
     Elsewhere,
+    FoundAgain,
     Understated,
     determined,
 )
-from estimators.integrity.places.hypotheses import Mixture, correct_linear, correct_range, predict
+from estimators.integrity.places.hypotheses import Drift, Mixture, correct_linear, correct_range, predict
 from estimators.integrity.thresholds import BLIND_TICKS
 from estimators.model.layout import Layout
 from estimators.model.measurements import RowTable, empty_rows, position_rows, range_row, velocity_rows
@@ -181,7 +182,61 @@ def test_fixes_end_the_doubt_at_once() -> None:
     monitor = AmbiguityMonitor(0, (np.zeros(6), WIDE), DT)
     here = START, SURE
     assert has(monitor.observe(blind(here, empty_rows())), What.AMBIGUOUS)
+    assert not has(monitor.observe(fixed(here)), What.AMBIGUOUS)
     assert monitor.observe(fixed(here)) == ()
+
+
+def test_the_fix_that_ends_a_doubt_meets_an_estimate_that_is_as_wide_as_the_doubt_was() -> None:
+    # GIVEN a drone that two neighbours hold, which may be anywhere on a circle, and an estimate that is sure
+    monitor, rng = AmbiguityMonitor(0, (START, WIDE), DT), np.random.default_rng(2)
+    two = {slot: TRIANGLE[slot] for slot in (1, 2)}
+    for tick in range(1, 30):
+        found = monitor.observe(blind((START, SURE), ranges(tick, START, two, rng), bodies(two)))
+    (doubt,) = [finding for finding in found if isinstance(finding, Understated)]
+    # WHEN fixes come back
+    (again,) = monitor.observe(fixed((START, SURE)))
+    # THEN this is said once
+    assert isinstance(again, FoundAgain)
+    np.testing.assert_allclose(again.second_moment, doubt.second_moment, atol=1e-6 * doubt.second_moment.max())
+    assert monitor.observe(fixed((START, SURE))) == ()
+
+
+def test_an_acceleration_that_errs_for_long_leaves_no_drone_sure_of_its_place_on_a_circle() -> None:
+    # GIVEN drones that two neighbours hold, flying to and fro, whose accelerations are off by 2 degrees of tilt
+    share = []
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        error, truth = np.array([*0.35 * rng.normal(size=2), 0.0]), START.copy()
+        drift = Drift(0.995, np.array([0.35, 0.35, 0.02]))
+        about = np.diag([1e-4] * 6 + [0.35**2, 0.35**2, 0.02**2])
+        monitor = AmbiguityMonitor(0, (np.concatenate([truth, np.zeros(3)]), about), DT)
+        two = {1: [9.0, 1.0, -5.0], 2: [-8.0, -2.0, -7.0]}
+        for tick in range(1, 250):
+            accel = np.array([np.sin(0.05 * tick), np.cos(0.07 * tick), 0.4 * np.sin(0.03 * tick)])
+            truth[:3] += DT * truth[3:] + 0.5 * DT**2 * accel
+            truth[3:] += DT * accel
+            estimate = np.concatenate([truth, error]), np.diag([0.01] * 9)
+            rows, others = ranges(tick, truth, two, rng), bodies(two)
+            told = DroneEvidence(False, True, estimate, rows, accel + error, QUIET, others, drift)
+            found = monitor.observe(told)
+            # WHEN the estimate is the truth THEN what is expected of its error is what the monitor does not know
+            moment = [each.second_moment for each in found if isinstance(each, Understated)]
+            share.append(bool(moment) and float(np.trace(moment[0][:3, :3])) > 0.5**2)
+            assert place_of(found) is None
+    assert np.mean(share) > 0.3
+
+
+def test_drones_without_fixes_that_hold_only_each_other_are_held_by_nobody() -> None:
+    rng = np.random.default_rng(4)
+    monitor = AmbiguityMonitor(0, (START, SURE), DT)
+    for tick in range(1, 10):
+        monitor.observe(blind((START, SURE), ranges(tick, START, APEX, rng), bodies(APEX)))
+    assert monitor.is_held(np.array([False, True, True, True, True]))
+    assert not monitor.is_held(np.array([False, True, True, False, False]))
+    assert not monitor.is_held(np.zeros(5, bool))
+    # but with a fix it is
+    monitor.observe(fixed((START, SURE)))
+    assert monitor.is_held(np.zeros(5, bool))
 
 
 @pytest.mark.parametrize(("variance", "used"), [(9.0, False), (0.01, True)])

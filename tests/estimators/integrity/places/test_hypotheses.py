@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from estimators.integrity.places.hypotheses import (
     MOST,
+    Drift,
     Mixture,
     correct_linear,
     correct_range,
@@ -71,6 +72,49 @@ def test_one_component_is_a_kalman_filter() -> None:
     assert mixture.covariances[0] == pytest.approx(covariance - np.outer(gain, slope) @ covariance)
     # THEN the weight is the density of the datum, up to a constant
     assert mixture.log_weights[0] == pytest.approx(-0.5 * (innovation**2 / total + np.log(total)))
+
+
+def test_the_error_of_an_acceleration_lasts_and_moves_the_drone_by_what_it_is_told_too_much() -> None:
+    rng = np.random.default_rng(5)
+    mean, covariance = rng.normal(size=9), random_covariance(rng, 9)
+    accel, noise, drift = rng.normal(size=3), np.array([0.1, 0.2, 0.3]), Drift(0.97, np.array([0.3, 0.4, 0.5]))
+
+    def moved(state: np.ndarray) -> np.ndarray:
+        net = accel - state[6:]
+        place = state[:3] + 0.1 * state[3:6] + 0.5 * 0.1**2 * net
+        return np.concatenate([place, state[3:6] + 0.1 * net, 0.97 * state[6:]])
+
+    mixture = Mixture.single(mean, covariance)
+    predict(mixture, accel, noise, 0.1, drift)
+    slope = np.array([moved(step) - moved(np.zeros(9)) for step in np.eye(9)]).T
+    expected = slope @ covariance @ slope.T
+    expected[:6, :6] += input_matrix(1, 0.1) @ np.diag(noise) @ input_matrix(1, 0.1).T
+    expected[6:, 6:] += (1.0 - 0.97**2) * np.diag(drift.size_mps2**2)
+    assert mixture.means[0] == pytest.approx(moved(mean))
+    assert mixture.covariances[0] == pytest.approx(expected)
+    # THEN an error of stationary size keeps it
+    alone = Mixture.single(np.zeros(9), np.diag([1.0] * 6 + [0.3**2, 0.4**2, 0.5**2]))
+    predict(alone, accel, noise, 0.1, drift)
+    assert alone.covariances[0, 6:, 6:] == pytest.approx(np.diag(drift.size_mps2**2))
+
+
+def test_rows_correct_the_error_of_an_acceleration_through_what_it_has_done() -> None:
+    rng = np.random.default_rng(6)
+    covariance, drift = np.diag([1e-4] * 6 + [0.16] * 3), Drift(1.0, np.full(3, 0.4))
+    error, truth = np.array([0.3, -0.2, 0.1]), np.zeros(6)
+    mixture = Mixture.single(np.concatenate([[5.0, 6.0, 7.0], np.zeros(6)]), covariance)
+    truth[:3] = [5.0, 6.0, 7.0]
+    places = 20.0 * np.vstack([np.eye(3), -np.eye(3)])
+    for _ in range(60):
+        truth[:3] += 0.1 * truth[3:]
+        predict(mixture, error, np.full(3, 1e-4), 0.1, drift)  # at rest, told of an acceleration
+        for place in places:
+            value = float(np.linalg.norm(truth[:3] - place)) + 0.02 * float(rng.normal())
+            correct_range(mixture, np.concatenate([place, np.zeros(3)]), NOWHERE, value, 0.02**2)
+        correct_linear(mixture, np.array([0.0, 0.0, 0.0, 0.0, 0.0, 1.0]), 0.0, 0.1)
+    off = mixture.means[0, 6:] - error
+    assert np.abs(off).max() < 0.05
+    assert 0.01 < off @ np.linalg.solve(mixture.covariances[0, 6:, 6:], off) < 14.0
 
 
 def test_a_range_from_far_is_a_linear_row() -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from estimators.integrity.places.hypotheses import Mixture
+from estimators.integrity.places.hypotheses import Drift, Mixture, predict
 from estimators.integrity.places.mirror_images import flat, hold_both_sides, image_of, mirrored_states
 from estimators.integrity.thresholds import CREDIT
 
@@ -73,3 +73,16 @@ def test_the_covariance_of_an_image_is_the_mirrored_one() -> None:
     _, mirrored = image_of(np.arange(6.0), spread, PLACES, STILL)
     assert mirrored[0, 2] == pytest.approx(-0.3)
     np.testing.assert_allclose(mirrored.diagonal(), spread.diagonal())
+
+
+def test_an_image_whose_acceleration_errs_goes_on_as_the_image() -> None:
+    drift, spread = Drift(0.99, np.full(3, 0.3)), np.diag(np.arange(1.0, 10.0))
+    state = np.array([1.0, 2.0, -3.0, 0.5, -0.4, 0.8, 0.3, -0.2, 0.4])
+    tilted = PLACES + np.array([[0.0, 0.0, 2.0], [0.0, 0.0, -1.0], [0.0, 0.0, 0.0]])
+    first, then = Mixture.single(state, spread), Mixture.single(*image_of(state, spread, tilted, STILL))
+    for mixture in (first, then):
+        predict(mixture, np.zeros(3), np.full(3, 0.01), 0.1, drift)
+    mean, covariance = image_of(first.means[0], first.covariances[0], tilted, STILL)
+    np.testing.assert_allclose(then.means[0], mean, atol=1e-9)
+    np.testing.assert_allclose(then.covariances[0], covariance, atol=1e-9)
+    assert np.abs(mean[6:] - first.means[0, 6:]).max() > 0.1

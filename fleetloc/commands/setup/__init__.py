@@ -1,1 +1,0 @@
-"""Commands for setting a drone up."""

@@ -54,6 +54,8 @@ def test_a_run_without_a_single_estimate_fails() -> None:
     found = verdict(run, {})
     assert found.failed
     assert found.line.startswith("FAILED: no drone had a single estimate")
+    run["fleet"]["interrupted"] = True
+    assert verdict(run, {}).line == "passed: no drone had a single estimate; interrupted; available 0.0 %"
 
 
 def test_who_died_an_interruption_and_an_overloaded_machine_are_said() -> None:

@@ -60,7 +60,8 @@ def read_requirements(text: str) -> dict[str, float]:
 def verdict(figures: Mapping[str, Any], required: Mapping[str, float]) -> RunVerdict:
     """Of the figures of a run, as ``report.json`` has them."""
     fleet, agents = figures["fleet"], figures["agents"]
-    failures, notes = [], []
+    failures: list[str] = []
+    notes: list[str] = []
     silent = [str(agent["id"]) for agent in agents if agent["ticks_without_estimate"] >= agent["ticks_expected"]]
     if len(silent) == len(agents):
         # whoever breaks a run off in its first second wants no estimate

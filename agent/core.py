@@ -34,6 +34,7 @@ from agent.fleet.measurements import (
     acceleration_measurement,
     anchor_measurement,
     gps_measurements,
+    height_measurement,
     range_measurement,
 )
 from agent.fleet.neighbourhood import rounds_of
@@ -42,10 +43,11 @@ from agent.fleet.tracking import ESTIMATOR_FAULTS as ESTIMATOR_FAULTS
 from agent.fleet.tracking import EstimatorFactory as EstimatorFactory
 from agent.fleet.tracking import FleetTracker, in_layout
 from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tell, estimate_message
+from agent.sensing.barometer import Barometer
 from agent.sensing.climb import without_climb
 from agent.sensing.gps_antenna import at_body
 from agent.sensing.latency import GpsLatency
-from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, RangeSample, Sample
+from agent.sensing.samples import AttitudeSample, BaroSample, GpsSample, ImuSample, RangeSample, Sample
 from agent.sensing.timeline import TickInput, Timeline, tick_of
 from agent.watch.health import HealthMonitor
 from agent.watch.integrity_watch import IntegrityWatch
@@ -105,6 +107,8 @@ class AgentCore:
         """Of all who may come: that of the estimates handed out."""
         self.timeline = timeline
         self.gps_latency = GpsLatency(self._period_s, config.sensors)
+        drifts = config.estimator.systematic_errors  # without, what drifts would be taken for true
+        self.barometer = Barometer() if config.sensors.barometer and drifts else None
         self.records = MeasurementStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
         self.watch = PositionWatch(config.transport.neighbour_timeout_s)
@@ -119,6 +123,8 @@ class AgentCore:
         self._barrier: RoundBarrier[Information | WindowStates] = RoundBarrier(max(self._rounds, 1))
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
+        self._altitude_m: float | None = None
+        """Own altitude above the fleet's origin, likewise."""
         self._climb_mps: float | None = None
         """Own rate of climb or descent by the last estimate."""
         self._fix_interval_s: float | None = None
@@ -149,6 +155,8 @@ class AgentCore:
             self.on_attitude(sample, now_s)
         elif isinstance(sample, GpsSample):
             self.on_gps(sample, now_s)
+        elif isinstance(sample, BaroSample):
+            self.on_baro(sample, now_s)
 
     def on_imu(self, sample: ImuSample, now_s: float) -> None:
         """An IMU sample."""
@@ -177,6 +185,19 @@ class AgentCore:
         if sample.receiver >= len(arms):
             return sample
         return at_body(sample, arms[sample.receiver], self.timeline.orientation_at(self.gps_latency.taken_s(sample)))
+
+    def on_baro(self, sample: BaroSample, now_s: float) -> None:
+        """A barometer's sample; of those in close succession one is used."""
+        if not self._plausible("baro", sample.t_s, now_s):
+            return
+        if self.barometer is None:
+            self.counters["baro: switched off"] += 1
+            return
+        height = self.barometer.take(sample, self._altitude_m)
+        if isinstance(height, str):
+            self.counters[f"baro: {height}"] += 1
+        else:
+            self._count_own("baro", height_measurement(self._agent_id, height, self._period_s))
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
         """A range that this agent's module measured."""
@@ -432,7 +453,7 @@ class AgentCore:
         changed = self.health.update(found, now_s)
         if self.fleet.started:
             self.far_field.note_own(estimate, own)
-            self._climb_mps = abs(float(estimate.mean[own][5]))
+            self._climb_mps, self._altitude_m = abs(float(estimate.mean[own][5])), -float(estimate.mean[own][2])
         reports = self.far_field.packet(self._tick)
         outputs += (ready, Tell(message))  # nothing fails from here on: no tick has two estimates
         if reports is not None:

@@ -70,6 +70,7 @@ LATER: Mapping[str, object] = {
     "estimator.systematic_errors": False,
     "estimator.robust": False,
     "fleet.joint_bodies": 999,
+    "sensors.barometer": False,
 }
 """Keys that came later, and what was so before them: a flight log without such a key was flown like that."""
 

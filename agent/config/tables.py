@@ -160,6 +160,9 @@ class SensorsTable(Table, frozen=True):
     """Least fix type (GPS_FIX_TYPE) of a fix that is used: 3 = 3-D, 4 = DGPS, 5 = RTK float, 6 = RTK fixed."""
     geoid_separation_m: float | None = None
     """Ellipsoid minus MSL height at the origin, for receivers that send only the other one."""
+    barometer: bool = True
+    """Use the autopilot's barometer, where it sends one and the estimator has `systematic_errors`: it tells how the
+    height changes, over minutes. Off where the drone flies in the wind of others, or indoors with doors that open."""
     uwb_sigma_m: Positive = 0.1
     """1-sigma of a range whose driver gives none."""
     uwb_sigma_floor_m: Positive = 0.03

@@ -14,6 +14,8 @@ from estimators.model.measurements import InputTable, RowTable
 from transport.errors import EncodeError
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
+    GroundHeightMeasurement,
+    HeightMeasurement,
     Measurement,
     Measurements,
     OrientationMeasurement,
@@ -100,6 +102,7 @@ class MeasurementStore:
         """What was heard since the last packet, by its identity."""
         self._rows: list[Measurement] = []
         self._inputs: list[AccelerationMeasurement] = []
+        self._takes_drift = config.estimator.systematic_errors
         self._proven = False
         """Whether neighbours prove the origin of what they relay: in signed fleets."""
         self.refused: Counter[str] = Counter()
@@ -317,7 +320,8 @@ class MeasurementStore:
         if record.tick < tick - KEEP_TICKS:
             self.refused["heard: too old"] += 1
             return False
-        if not self.neighbourhood.uses(record):
+        drifts = isinstance(record, HeightMeasurement) and not isinstance(record, GroundHeightMeasurement)
+        if not self.neighbourhood.uses(record) or (drifts and not self._takes_drift):
             self.refused["heard: not used"] += 1
             return False
         return True

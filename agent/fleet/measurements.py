@@ -17,7 +17,8 @@ import numpy as np
 
 from agent.config.tables import SensorsTable
 from agent.fleet.lever_arms import LeverArms, Shift
-from agent.sensing.samples import GpsSample, RangeSample, Triple
+from agent.sensing.barometer import SIGMA_M
+from agent.sensing.samples import BaroSample, GpsSample, RangeSample, Triple
 from agent.sensing.timeline import TickInput, nearest_tick
 from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
 from transport.messages.measurement_body import (
@@ -25,6 +26,8 @@ from transport.messages.measurement_body import (
     AccelerationMeasurement,
     AnchorRangeMeasurement,
     AntennaSpeedMeasurement,
+    GroundHeightMeasurement,
+    HeightMeasurement,
     Measurement,
     OrientationMeasurement,
     PositionMeasurement,
@@ -110,6 +113,12 @@ def anchor_measurement(
     return AnchorRangeMeasurement(said.observer, said.tick, seen, said.range_m, *noise, said.offset_s)
 
 
+def height_measurement(observer: int, sample: BaroSample, period_s: float) -> HeightMeasurement:
+    """The record of a barometer's sample, whose altitude is above the fleet's origin."""
+    tick = nearest_tick(sample.t_s, period_s)
+    return HeightMeasurement(observer, tick, -sample.altitude_m, SIGMA_M**2, sample.t_s - tick * period_s)
+
+
 def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
     """The record of a tick's averaged acceleration."""
     return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)
@@ -145,6 +154,10 @@ def rows_of(
             case AnchorRangeMeasurement():
                 noise, kind = (record.variance_m2, record.half_width_m), Kind.ANCHOR_RANGE
                 rows.append((tick, record.offset_s, record.range_m, *noise, *record.anchor_m, kind, slot, -1, slot))
+            case HeightMeasurement():
+                noise, kind = (record.variance_m2, math.inf), Kind.HEIGHT
+                drifts = 0.0 if isinstance(record, GroundHeightMeasurement) else 1.0
+                rows.append((tick, record.offset_s, record.down_m, *noise, drifts, 0.0, 0.0, kind, slot, -1, slot))
             case AccelerationMeasurement() | OrientationMeasurement():
                 raise TypeError(f"not a measurement that makes rows: {record}")
     table = np.array(rows, ROW)

@@ -30,6 +30,9 @@ SENSORS = {
     mavlink.MAVLINK_MSG_ID_ATTITUDE: "attitude",
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: "gps",
     mavlink.MAVLINK_MSG_ID_GPS2_RAW: "gps",
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: "baro",
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2: "baro",
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE3: "baro",
 }
 """Messages that show that their sender has sensors, by id: the kind."""
 

@@ -16,10 +16,11 @@ from agent.mavlink.boot_times import WRAP_MS_S, WRAP_US_S, turns
 from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.components import SENSORS
 from agent.mavlink.utc_stamps import UtcStamps, unrolled
+from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.latency import Stamp, gps_prior, imu_latency_s
 from agent.sensing.receivers import ReceiverChoice
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Sample, Triple
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample, Sample, Triple
 
 MILLI_G_MPS2 = 9.80665e-3
 UNKNOWN_16 = 65535
@@ -45,7 +46,15 @@ _SCALED_IMUS = (
     mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
     mavlink.MAVLINK_MSG_ID_SCALED_IMU3,
 )
+_PRESSURES = (
+    mavlink.MAVLINK_MSG_ID_HIGHRES_IMU,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2,
+    mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE3,
+)
+"""The best one first: of PX4 HIGHRES_IMU comes more often."""
 _ACCEL_AND_GYRO = 0b111111
+_ABSOLUTE_PRESSURE = int(mavlink.HIGHRES_IMU_UPDATED_ABS_PRESSURE)
 MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
 """Per axis; beyond what any IMU of a drone can measure (100 g, 5700 deg/s), so no measurement."""
 
@@ -132,6 +141,15 @@ class SampleAdapter:
             self.received[kind] += 1
         return None if converter is None else converter(self, message, arrival_s)
 
+    def pressure_beside(self, message: Message, arrival_s: float) -> Sample | None:
+        """The barometer's sample in a message of the IMU's; ``None`` if there is none in it."""
+        if message.get_msgId() != mavlink.MAVLINK_MSG_ID_HIGHRES_IMU or message.id:
+            return None
+        if not message.fields_updated & _ABSOLUTE_PRESSURE:
+            return None
+        self.received["baro"] += 1
+        return self._pressure(message.abs_pressure, message.time_usec, arrival_s, message.get_msgId(), WRAP_US_S)
+
     # --- IMU and attitude ----------------------------------------------------------------------------------
 
     def _highres_imu(self, message: Message, arrival_s: float) -> Sample | None:
@@ -195,6 +213,24 @@ class SampleAdapter:
         self._was_aided = self._was_aided or aided
         self.aided = aided or not self._was_aided  # before its first position it stands still: gravity levels it
         return None
+
+    # --- barometer -----------------------------------------------------------------------------------------
+
+    def _scaled_pressure(self, message: Message, arrival_s: float) -> Sample | None:
+        """SCALED_PRESSURE, SCALED_PRESSURE2 and 3: the autopilot's first, second and third barometer."""
+        boot_us = message.time_boot_ms * 1000
+        return self._pressure(message.press_abs, boot_us, arrival_s, message.get_msgId(), WRAP_MS_S)
+
+    def _pressure(
+        self, pressure_hpa: float, time_usec: int, arrival_s: float, message_id: int, wrap_s: float
+    ) -> Sample | None:
+        altitude_m = pressure_altitude_m(pressure_hpa)
+        if altitude_m is None:
+            return self._skip("baro: no pressure of air")
+        if not self._serves("baro", _PRESSURES.index(message_id), arrival_s):
+            return None
+        t_s = self._stamp(time_usec, arrival_s, "baro", wrap_s)
+        return None if t_s is None else BaroSample(t_s, altitude_m)
 
     # --- GPS -----------------------------------------------------------------------------------------------
 
@@ -383,6 +419,7 @@ _CONVERTERS: dict[int, Callable[[SampleAdapter, Message, float], Sample | None]]
     mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: SampleAdapter._highres_imu,
     mavlink.MAVLINK_MSG_ID_RAW_IMU: SampleAdapter._raw_imu,
     **dict.fromkeys(_SCALED_IMUS, SampleAdapter._scaled_imu),
+    **dict.fromkeys(_PRESSURES[1:], SampleAdapter._scaled_pressure),
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: SampleAdapter._attitude_quaternion,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: SampleAdapter._attitude,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: SampleAdapter._gps_raw_int,

@@ -43,6 +43,7 @@ LOCAL_POSITION_HZ = 2.0
 """For comparison only, never a measurement."""
 FED_POSITION_HZ, FED_STATUS_HZ = 10.0, 5.0
 """The same where the autopilot is given the estimate: what it makes of that is watched."""
+PRESSURE_HZ = 4.0
 ESTIMATOR_STATUS_HZ = 2.0
 """Whether the autopilot's attitude is aided: an attitude without positions is tilted within a second."""
 _ESTIMATOR_STATUS = {
@@ -104,6 +105,7 @@ class AutopilotSession:
         )
         self._fed = config.feeds(agent_id)
         self.rates = StreamRates(_wanted(config, self._fed))
+        self._asks_pressure = config.sensors.barometer
         self.follower: Callable[[Message, float | None, float], None] | None = None
         """Gets every message of the autopilot, its stamp of the boot clock in fleet time, and the host time."""
         self.state = LinkState.SEARCHING
@@ -134,7 +136,7 @@ class AutopilotSession:
 
     def receive(self, data: bytes, now_s: float) -> list[Sample]:
         """Take in bytes of the link; the samples they hold. Answers are fetched by `to_send`."""
-        samples = []
+        samples: list[Sample] = []
         self._tell_time(now_s)
         own = (self._encoder.system_id, self._encoder.component_id)
         for message in self.decoder.feed(data):
@@ -142,9 +144,7 @@ class AutopilotSession:
                 self.ignored["own frame"] += 1  # sent back to us, well signed or not: nobody's word but ours
                 continue
             self.heard += message.get_srcSystem() == self._expected_system
-            sample = self._on_message(message, now_s)
-            if sample is not None:
-                samples.append(sample)
+            samples += self._on_message(message, now_s)
         return samples
 
     def to_send(self, now_s: float, system_status: int | None) -> list[bytes]:
@@ -182,32 +182,34 @@ class AutopilotSession:
 
     # --- incoming ------------------------------------------------------------------------------------------
 
-    def _on_message(self, message: Message, now_s: float) -> Sample | None:
+    def _on_message(self, message: Message, now_s: float) -> list[Sample]:
         message_id = message.get_msgId()
         if message_id == mavlink.MAVLINK_MSG_ID_HEARTBEAT:
             self._on_heartbeat(message, now_s)
-            return None
+            return []
         if message_id in SENSORS and message.get_srcSystem() == self._expected_system:
             self._sensed_s.setdefault(message.get_srcComponent(), {})[SENSORS[message_id]] = now_s
         source = (message.get_srcSystem(), message.get_srcComponent())
         if self.autopilot is None or source != (self.autopilot.system_id, self.autopilot.component_id):
             self._on_stranger(message)
-            return None
+            return []
         if self.follower is not None:
             self.follower(message, self._stamped_s(message, now_s), now_s)
         if message_id == mavlink.MAVLINK_MSG_ID_TIMESYNC:
             self._on_timesync(message, now_s)
-            return None
+            return []
         if message_id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
             self._on_ack(message, now_s)
-            return None
+            return []
         self.rates.on_message(message_id)
         if message_id == mavlink.MAVLINK_MSG_ID_GPS2_RAW:  # there is a second receiver
             self.rates.add(message_id, self._settings.gps_hz)
         boot_s = shown_boot_s(message)
         if boot_s is not None:
             self._on_boot_time(boot_s, now_s)
-        return self.samples.convert(message, self._fleet_clock.fleet_s(now_s))
+        arrival_s = self._fleet_clock.fleet_s(now_s)
+        both = self.samples.convert(message, arrival_s), self.samples.pressure_beside(message, arrival_s)
+        return [sample for sample in both if sample is not None]
 
     def _on_heartbeat(self, message: Message, now_s: float) -> None:
         if not speaks_for_vehicle(message):
@@ -287,6 +289,8 @@ class AutopilotSession:
         if self.autopilot.flavour == "ardupilot" and refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU):
             self.rates.add(mavlink.MAVLINK_MSG_ID_RAW_IMU, settings.imu_hz)
         unscaled = self.autopilot.flavour != "ardupilot" and refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU)
+        if self._asks_pressure and refused(mavlink.MAVLINK_MSG_ID_HIGHRES_IMU):  # which would hold it
+            self.rates.add(mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE, PRESSURE_HZ)
         if unscaled or refused(mavlink.MAVLINK_MSG_ID_RAW_IMU):
             self.rates.add(mavlink.MAVLINK_MSG_ID_SCALED_IMU, settings.imu_hz)
         if refused(mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION):

@@ -73,6 +73,23 @@ class GpsSample:
 
 
 @dataclass(frozen=True, slots=True)
+class BaroSample:
+    """What a barometer said, as an altitude in m (up) in the standard atmosphere, or above what its user says."""
+
+    t_s: float
+    altitude_m: float
+
+
+@dataclass(frozen=True, slots=True)
+class GroundSample:
+    """The distance in m along the body's down axis to the ground, 1-sigma in m."""
+
+    t_s: float
+    distance_m: float
+    sigma_m: float
+
+
+@dataclass(frozen=True, slots=True)
 class RangeSample:
     """A range in m from agent ``observer`` to agent ``target``, 1-sigma in m; of which of their antennas."""
 
@@ -94,4 +111,4 @@ class AutopilotEstimate:
     velocity_mps: Triple
 
 
-Sample = ImuSample | AttitudeSample | GpsSample | RangeSample | AutopilotEstimate
+Sample = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | RangeSample | AutopilotEstimate

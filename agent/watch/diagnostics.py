@@ -74,7 +74,7 @@ def _rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-_ON_THE_LINK = ("imu", "attitude", "gps")
+_ON_THE_LINK = ("imu", "attitude", "gps", "baro")
 
 
 def counters_of(onboard: OnboardAgent) -> dict[str, int]:
@@ -214,6 +214,7 @@ def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
         "nis_gps_position": squares[Kind.POSITION],
         "nis_gps_velocity": squares[Kind.VELOCITY],
         "nis_gps_speed": squares[Kind.SPEED],
+        "nis_heights": squares[Kind.HEIGHT],
         "nis_ranges": squares[Kind.RANGE] if slot == own else innovations.pairs[own, slot],
         "weight_gps_position": innovations.weights[slot, Kind.POSITION],
     }

@@ -34,6 +34,9 @@ class Kind(IntEnum):
     of the one end's antenna less that of the other's."""
     ANCHOR_RANGE = 4
     """``sqrt(|p_agent - anchor|^2 + eps^2)`` in m; the anchor is in ``x, y, z``."""
+    HEIGHT = 5
+    """The third component of ``p + v o``, NED m; ``x`` is how much it holds of the agent's height errors: 1 for a
+    barometer, 0 for a range finder above known ground."""
 
 
 ROW = np.dtype(
@@ -43,7 +46,7 @@ ROW = np.dtype(
         ("value", np.float64),  # m or m/s
         ("variance", np.float64),  # of the noise, unit of value squared
         ("half_width", np.float64),  # hard bound on the noise; inf where the sensor has none
-        ("x", np.float64),  # unit direction (POSITION, VELOCITY), anchor (ANCHOR_RANGE) or shift s (others), NED
+        ("x", np.float64),  # unit direction (POSITION, VELOCITY), anchor (ANCHOR_RANGE), shift s (others), NED
         ("y", np.float64),
         ("z", np.float64),
         ("kind", np.int32),
@@ -253,6 +256,34 @@ def anchor_range_row(
         x=anchor[0],
         y=anchor[1],
         z=anchor[2],
+        agent=agent,
+        observer=agent,
+    )
+
+
+def height_row(
+    tick: int,
+    agent: int,
+    down_m: float,
+    variance: float,
+    *,
+    offset_s: float = 0.0,
+    half_width_m: float = np.inf,
+    drifts: bool,
+) -> RowTable:
+    """The row of a height: ``down_m`` is NED.
+
+    ``drifts``: of a barometer, whose error is slow (`estimators.systematic.slow_errors`).
+    """
+    return _rows(
+        1,
+        kind=Kind.HEIGHT,
+        tick=tick,
+        offset_s=offset_s,
+        value=down_m,
+        variance=variance,
+        half_width=half_width_m,
+        x=float(drifts),
         agent=agent,
         observer=agent,
     )

@@ -24,6 +24,8 @@ VELOCITY = int(Kind.VELOCITY)
 SPEED = int(Kind.SPEED)
 RANGE = int(Kind.RANGE)
 ANCHOR_RANGE = int(Kind.ANCHOR_RANGE)
+HEIGHT = int(Kind.HEIGHT)
+LAST_KIND = int(max(Kind))
 
 OFFSET, VALUE, PRECISION, HALF_WIDTH, X, Y, Z = range(7)
 
@@ -41,7 +43,7 @@ def mark_usable(rows: RowTable, agents: int, usable: NDArray[np.bool_]) -> None:
         other = row["other"]
         finite = np.isfinite(row["offset_s"]) and np.isfinite(row["value"]) and np.isfinite(row["variance"])
         finite = finite and np.isfinite(row["x"]) and np.isfinite(row["y"]) and np.isfinite(row["z"])
-        known = 0 <= row["agent"] < agents and 0 <= row["observer"] < agents and 0 <= kind <= ANCHOR_RANGE
+        known = 0 <= row["agent"] < agents and 0 <= row["observer"] < agents and 0 <= kind <= LAST_KIND
         paired = (0 <= other < agents and other != row["agent"]) if kind == RANGE else other == -1
         usable[r] = finite and row["variance"] > 0.0 and row["half_width"] > 0.0 and known and paired
 
@@ -101,6 +103,12 @@ def predict_row(code: IntArray, data: Matrix, r: int, x: Vector, eps: float, uni
             unit[2] = data[r, Z]
             unit[3] = 0.0
             return float(unit[0] * e0 + unit[1] * e1 + unit[2] * e2)
+        if kind == HEIGHT:
+            unit[0] = 0.0
+            unit[1] = 0.0
+            unit[2] = 1.0
+            unit[3] = 0.0
+            return float(e2)
         if kind == RANGE:
             b = code[r, 2]
             e0 -= x[b] + offset * x[b + 3] - data[r, X]

@@ -35,6 +35,9 @@ LOST_S = 1.0
 """Without fixes for longer, an autopilot's attitude is taken for that of an estimator without aiding."""
 TARGET_PAIR_M = 0.5
 """Of the bias of ranges to a body that is no vehicle: of another sensor, of which the fleet's tell nothing."""
+DRIFT_M, SCALE = 10.0, 0.04
+"""Of a barometer: 10 m cover where it is put at first, and are, with its time constant, 0.4 m in a minute and 3 m in
+an hour; 4 % of the height are 12 K."""
 MEMORY_S = 3.0
 """Of the second moments."""
 
@@ -84,6 +87,7 @@ class SystematicSizes:
         tilted = np.where(self._lost_ticks > self._most_ticks, TILTED_MPS2, 0.0)
         _fill(self._wanders.sizes_m(), self._accel_mps2, tilted, self._pair_m, out)
         out[slow_errors.pairs(agents)][self._of_target] = TARGET_PAIR_M
+        out[slow_errors.drifts(agents)], out[slow_errors.scales(agents)] = DRIFT_M, SCALE
         return out
 
     def white_factors(self) -> Matrix:

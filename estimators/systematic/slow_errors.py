@@ -1,16 +1,18 @@
 """The slow errors of a fleet's sensors, as constants over a window that its rows and inputs hold.
 
 What lasts for longer than a window is no noise: the wander of a receiver's fixes, of its own and common to all that
-see the same sky; the error of an acceleration by bias and tilt; the bias of the ranges between two antennas. Each is
-a Gauss-Markov process that enters the rows:
+see the same sky; the error of an acceleration by bias and tilt; the bias of the ranges between two antennas; the
+drift of a barometer, and the scale of its heights, as air is colder or warmer than that of the standard atmosphere.
+Each is a Gauss-Markov process that enters the rows:
 
     fix of agent a along u:        + u . w_a + u . w
     range between a and b:         + b_ab
     acceleration of a:             + e_a
+    barometer of a, at height z:   + d_a + z k_a
 
-Their sizes follow the data (`estimators.systematic.sizes`). Order of the q errors: wander ``3n``, acceleration
-``3n``, common wander ``3``, pairs ``n (n - 1) / 2``. A row with a hard bound has none: its sensor is said to have no
-others.
+Their sizes follow the data, but for those of barometers (`estimators.systematic.sizes`). Order of the q errors:
+wander ``3n``, acceleration ``3n``, common wander ``3``, pairs ``n (n - 1) / 2``, drift of barometers ``n``, their
+scale ``n``. A row with a hard bound has none: its sensor is said to have no others.
 """
 
 from __future__ import annotations
@@ -21,7 +23,7 @@ import numpy as np
 
 from estimators.compiled.entries import entry
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
-from estimators.model.row_kernels import POSITION, RANGE, IntArray
+from estimators.model.row_kernels import HEIGHT, POSITION, RANGE, IntArray
 
 WANDER_S = 60.0
 """Time constant of the wander of fixes."""
@@ -29,13 +31,15 @@ ACCELERATION_S = 20.0
 """Of the error of accelerations in NED: a bias turns with the body, a tilt lasts longer."""
 PAIR_S = 300.0
 """Of the bias of ranges between two antennas."""
+HEIGHT_S = 80_000.0
+"""Of the drift of a barometer and of its scale: both go with the weather."""
 COUPLED = 7
 """Slow errors in one row at most, and one place that ends the list."""
 
 
 def count(agents: int) -> int:
     """How many slow errors a fleet has."""
-    return 6 * agents + 3 + agents * (agents - 1) // 2
+    return 8 * agents + 3 + agents * (agents - 1) // 2
 
 
 def wander_of(slot: int) -> slice:
@@ -55,13 +59,23 @@ def common(agents: int) -> slice:
 
 def pairs(agents: int) -> slice:
     """Biases of the ranges, m."""
-    return slice(6 * agents + 3, count(agents))
+    return slice(6 * agents + 3, 6 * agents + 3 + agents * (agents - 1) // 2)
 
 
 def pair_of(one: int, other: int, agents: int) -> int:
     """Bias of the ranges between two agents."""
     a, b = min(one, other), max(one, other)
     return 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1
+
+
+def drifts(agents: int) -> slice:
+    """Drifts of the barometers, NED m."""
+    return slice(count(agents) - 2 * agents, count(agents) - agents)
+
+
+def scales(agents: int) -> slice:
+    """Scales of the barometers' heights, less one."""
+    return slice(count(agents) - agents, count(agents))
 
 
 def kept_per_tick(agents: int, period_s: float) -> Vector:
@@ -71,6 +85,7 @@ def kept_per_tick(agents: int, period_s: float) -> Vector:
     times[3 * agents : 6 * agents] = ACCELERATION_S
     times[common(agents)] = WANDER_S
     times[pairs(agents)] = PAIR_S
+    times[drifts(agents)] = times[scales(agents)] = HEIGHT_S
     return np.exp(-period_s / times)
 
 
@@ -84,6 +99,8 @@ def places_before(before: int, stayed: Mapping[int, int], after: int) -> IntArra
     for slot, old in stayed.items():
         was[wander_of(slot)] = np.arange(3 * old, 3 * old + 3)
         was[acceleration_of(slot, after)] = np.arange(3 * (before + old), 3 * (before + old) + 3)
+        was[drifts(after).start + slot] = drifts(before).start + old
+        was[scales(after).start + slot] = scales(before).start + old
         for other, old_other in stayed.items():
             if other > slot:
                 was[pair_of(slot, other, after)] = pair_of(old, old_other, before)
@@ -110,6 +127,10 @@ def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
                     at[r, j], by[r, j] = 3 * row["agent"] + i, direction[i]
                     at[r, j + 1], by[r, j + 1] = 6 * agents + i, direction[i]
                     j += 2
+        elif row["kind"] == HEIGHT and row["x"] != 0.0:
+            drift = 6 * agents + 3 + agents * (agents - 1) // 2 + row["agent"]
+            at[r, 0], by[r, 0] = drift, row["x"]
+            at[r, 1], by[r, 1] = drift + agents, row["x"] * row["value"]
         elif row["kind"] == RANGE:
             a, b = min(row["agent"], row["other"]), max(row["agent"], row["other"])
             at[r, 0], by[r, 0] = 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1, 1.0

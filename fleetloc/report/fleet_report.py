@@ -28,8 +28,10 @@ from transport.messages.report_body import Diagnostics
 
 SETTLED_S = 10.0
 """Errors are also given from here on, when what an agent knew at its start is forgotten."""
-SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "range": "uwb"}
+SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "baro": "baro", "range": "uwb"}
 """Names of the core's counters, and of the counters of what was left out before."""
+LEFT_OUT = ("switched off", "place unknown", "more than are needed", "always the same")
+"""Why the core uses no sample of a sensor that came in time."""
 
 
 def write_report(
@@ -171,7 +173,7 @@ def _of_sensor(name: str, left_out: str, total: Counter[str]) -> dict[str, Any]:
         if key.startswith(f"skipped {left_out}") and count
     }
     late = total[f"{name}: late"] + reasons.pop("late", 0)
-    for reason in ("wrong time", "refused", "not ours", "not located"):
+    for reason in ("wrong time", "refused", "not ours", "not located", *LEFT_OUT):
         if total[f"{name}: {reason}"]:
             reasons[reason] = reasons.get(reason, 0) + total[f"{name}: {reason}"]
     if total[f"{name}: waiting"]:

@@ -73,6 +73,7 @@ PX4 = Flavour(
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME: 1.0,
         mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: 5.0,
         mavlink.MAVLINK_MSG_ID_SCALED_IMU: 0.0,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: 1.0,
         mavlink.MAVLINK_MSG_ID_ATTITUDE: 50.0,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: 50.0,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: 30.0,
@@ -129,6 +130,7 @@ ARDUPILOT = Flavour(
             mavlink.MAVLINK_MSG_ID_GPS_RAW_INT,
             mavlink.MAVLINK_MSG_ID_RAW_IMU,
             mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
             mavlink.MAVLINK_MSG_ID_ATTITUDE,
             mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION,
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -182,6 +184,7 @@ STREAM_GROUPS: dict[int, tuple[int, ...]] = {
     mavlink.MAV_DATA_STREAM_RAW_SENSORS: (
         mavlink.MAVLINK_MSG_ID_RAW_IMU,
         mavlink.MAVLINK_MSG_ID_SCALED_IMU2,
+        mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE,
     ),
     mavlink.MAV_DATA_STREAM_EXTENDED_STATUS: (
         mavlink.MAVLINK_MSG_ID_SYS_STATUS,

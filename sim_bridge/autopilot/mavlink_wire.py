@@ -19,6 +19,7 @@ SATELLITES_UNKNOWN = 0xFF
 SATELLITES_USED = 14
 FIX_NO_GPS, FIX_NONE, FIX_3D = 0, 1, 3
 HIGHRES_ALL_UPDATED = 0x1FFF
+HIGHRES_PRESSURE = mavlink.HIGHRES_IMU_UPDATED_ABS_PRESSURE | mavlink.HIGHRES_IMU_UPDATED_PRESSURE_ALT
 TEMPERATURE_DEG_C = 35.0
 
 
@@ -44,13 +45,20 @@ def highres_imu(time_us: int, imu: SensedImu) -> Message:
         *(float(axis) for axis in imu.accel_mps2),
         *(float(axis) for axis in imu.gyro_rps),
         *(float(axis) for axis in imu.mag_gauss),
-        imu.pressure_hpa,
+        imu.pressure_hpa or 0.0,
         0.0,
-        imu.pressure_alt_m,
+        imu.pressure_alt_m if imu.pressure_hpa else 0.0,
         TEMPERATURE_DEG_C,
-        HIGHRES_ALL_UPDATED,
+        HIGHRES_ALL_UPDATED if imu.pressure_hpa else HIGHRES_ALL_UPDATED & ~HIGHRES_PRESSURE,
         id=0,
     )
+
+
+def scaled_pressure(time_ms: int, imu: SensedImu) -> Message | None:
+    """SCALED_PRESSURE: hPa, and the sensor's own temperature, which is not that of the air; ``None`` without one."""
+    if imu.pressure_hpa is None:
+        return None
+    return mavlink.MAVLink_scaled_pressure_message(time_ms, imu.pressure_hpa, 0.0, round(100.0 * TEMPERATURE_DEG_C))
 
 
 def _scaled_axes(imu: SensedImu) -> tuple[int, ...]:

@@ -43,6 +43,7 @@ class StreamMessages:
             mavlink.MAVLINK_MSG_ID_SCALED_IMU2: lambda now: wire.scaled_imu2(self._ms(now), vehicle.imu()),
             mavlink.MAVLINK_MSG_ID_RAW_IMU: lambda now: wire.raw_imu(self._us(now), vehicle.imu()),
             mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: lambda now: wire.highres_imu(self._us(now), vehicle.imu()),
+            mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: lambda now: wire.scaled_pressure(self._ms(now), vehicle.imu()),
             mavlink.MAVLINK_MSG_ID_ATTITUDE: self._attitude,
             mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: self._attitude_quaternion,
             mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED: self._local_position,

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field, replace
 from agent.config.tables import FleetConfig
 from agent.core import EstimatorFactory
 from agent.onboard import OnboardAgent
-from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample
+from agent.sensing.samples import Sample
 from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.replay.feed import Arrival, Feed, Heard
 from sim_bridge.replay.side_files.range_files import RangeLine
@@ -137,7 +137,7 @@ class Replay:
         arrival_s = heard.t_s + LINK_S if self._inputs.at_stamps else now_s
         self._queue.at(arrival_s, functools.partial(self._on_sample, agent_id, heard))
 
-    def _on_sample(self, agent_id: int, sample: ImuSample | AttitudeSample | GpsSample) -> None:
+    def _on_sample(self, agent_id: int, sample: Sample) -> None:
         if agent_id in self._left:
             self._counts.ranges["sample after its log's end"] += 1
             return

@@ -16,7 +16,14 @@ from dataclasses import dataclass, field, replace
 from operator import itemgetter
 from typing import Any, Protocol
 
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+)
 from sim_bridge.replay.injection import Injection
 from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan
@@ -24,7 +31,7 @@ from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine
 from sim_bridge.replay.synthesis import Synthesiser
 from sim_bridge.replay.what_if import GpsDrops
 
-Heard = ImuSample | AttitudeSample | GpsSample | RangeLine
+Heard = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | RangeLine
 """What agents get, stamped in fleet time."""
 Arrival = tuple[float, int, Heard | None]
 """Fleet time of arrival, agent, and what arrived; ``None``: nothing for an agent, but that late it is."""
@@ -207,4 +214,6 @@ def _shifted(sample: LogSample, shift_s: float) -> LogSample:
         return ImuSample(sample.t_s + shift_s, sample.specific_force_mps2, sample.gyro_radps)
     if isinstance(sample, AttitudeSample):
         return AttitudeSample(sample.t_s + shift_s, sample.quaternion, sample.aided)
+    if isinstance(sample, BaroSample):
+        return BaroSample(sample.t_s + shift_s, sample.altitude_m)
     return replace(sample, t_s=sample.t_s + shift_s)

@@ -94,6 +94,21 @@ class UwbNoise:
 
 
 @dataclass(frozen=True, slots=True)
+class BarometerNoise:
+    """A barometer: wrong by an offset that it was switched on with, and by a drift, first-order Gauss-Markov.
+
+    ``scale_sigma``: of its heights, since the air is not that of the standard atmosphere.
+    """
+
+    sigma_m: float = 0.0
+    """White noise of a sample."""
+    offset_sigma_m: float = 0.0
+    drift_sigma_m: float = 0.0
+    drift_correlation_s: float = 1000.0
+    scale_sigma: float = 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class NoiseProfile:
     """All sensors of a fleet; the IMU depends on the autopilot, which filters it differently."""
 
@@ -101,6 +116,8 @@ class NoiseProfile:
     attitude: AttitudeNoise = field(default_factory=AttitudeNoise)
     gps: GpsNoise = field(default_factory=GpsNoise)
     uwb: UwbNoise = field(default_factory=UwbNoise)
+    barometer: BarometerNoise | None = None
+    """Absent = the vehicles have none."""
 
 
 _PAPER_IMU = ImuNoise(held_uniform_mps2=0.1)
@@ -147,6 +164,7 @@ REALISTIC = NoiseProfile(
         nlos_probability=0.03,
         reported_sigma_m=0.1,
     ),
+    barometer=BarometerNoise(sigma_m=0.12, offset_sigma_m=3.0, drift_sigma_m=1.0, scale_sigma=0.03),
 )
 """Recorded flights and public UWB data: biased pairs, a tail without line of sight, late wandering GPS."""
 
@@ -177,6 +195,7 @@ NOM = NoiseProfile(
         speed_acc_mps=0.2,
     ),
     uwb=UwbNoise(sigma_m=0.1, bias_mean_m=0.35, bias_uniform_m=0.15, nlos_probability=0.03, nlos_max_m=math.inf),
+    barometer=BarometerNoise(sigma_m=0.12, offset_sigma_m=3.0, drift_sigma_m=0.8, scale_sigma=0.03),
 )
 """The usual errors of sensors that nobody has calibrated, and that claim to be good: they do not average out."""
 

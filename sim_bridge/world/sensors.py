@@ -14,7 +14,16 @@ import numpy as np
 from sim_bridge.faults.sensor_faults import NO_ERROR, RangeError, SensorFaults
 from sim_bridge.world import geodesy, quaternions
 from sim_bridge.world.guidance import moved_along
-from sim_bridge.world.noise import PROFILES, AttitudeNoise, GaussMarkov, GpsNoise, ImuNoise, UwbNoise, uncalibrated
+from sim_bridge.world.noise import (
+    PROFILES,
+    AttitudeNoise,
+    BarometerNoise,
+    GaussMarkov,
+    GpsNoise,
+    ImuNoise,
+    UwbNoise,
+    uncalibrated,
+)
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Scenario
 from sim_bridge.world.world import FleetWorld
@@ -32,7 +41,8 @@ class SensedImu:
     accel_mps2: Array
     gyro_rps: Array
     mag_gauss: Array
-    pressure_hpa: float
+    pressure_hpa: float | None
+    """``None`` without a barometer; the altitude beside it is that of the standard atmosphere."""
     pressure_alt_m: float
 
 
@@ -133,6 +143,23 @@ class _Imu:
         if white == 0.0:
             return true + self._gyro_bias
         return np.asarray(true + self._gyro_bias + white * self._rng.standard_normal(3))
+
+
+class _Barometer:
+    """Errors of one vehicle's barometer."""
+
+    def __init__(self, noise: BarometerNoise, start_m: float, rng: np.random.Generator) -> None:
+        """``start_m``: altitude that it is switched on at; its scale is about that."""
+        self._noise, self._start_m, self._rng = noise, start_m, rng
+        self._offset_m = noise.offset_sigma_m * float(rng.standard_normal())
+        self._scale = noise.scale_sigma * float(rng.standard_normal())
+        self._drift = GaussMarkov(np.array([noise.drift_sigma_m]), noise.drift_correlation_s, rng)
+
+    def altitude_m(self, true_m: float, time_s: float) -> float:
+        """Pressure altitude of a true one above mean sea level."""
+        white_m = self._noise.sigma_m * float(self._rng.standard_normal())
+        scaled_m = self._scale * (true_m - self._start_m)
+        return true_m + scaled_m + self._offset_m + float(self._drift.at(time_s)[0]) + white_m
 
 
 class _AttitudeError:
@@ -273,12 +300,17 @@ class FleetSensors:
         self._scenario, self._world, self._start_fleet_s = scenario, world, start_fleet_s
         profile = PROFILES[scenario.profile]
         count = len(scenario.ids)
-        kinds = np.random.SeedSequence((scenario.seed, 1)).spawn(7)
+        kinds = np.random.SeedSequence((scenario.seed, 1)).spawn(8)
         imu, held, attitude, gps, _, heading = (
             [np.random.default_rng(seed) for seed in kind.spawn(count)] for kind in kinds[:6]
         )
         imu_noise = [profile.imu[vehicle.flavour] for vehicle in scenario.vehicles]
         self._imu = [_Imu(noise, rng) for noise, rng in zip(imu_noise, imu, strict=True)]
+        self._barometers = [
+            _Barometer(profile.barometer, self._altitude_msl_m(slot), np.random.default_rng(seed))
+            for slot, seed in enumerate(kinds[7].spawn(count))
+            if profile.barometer is not None
+        ]
         self._held = _HeldNoise(np.array([noise.held_uniform_mps2 for noise in imu_noise]), held)
         self._attitude_error = [
             _AttitudeError(profile.attitude, *rngs) for rngs in zip(attitude, heading, strict=True)
@@ -327,18 +359,22 @@ class FleetSensors:
     def imu(self, slot: int) -> SensedImu:
         """A new sample of one vehicle's inertial sensors, magnetometer and barometer."""
         self._to_body()
-        frame = self._scenario.frame
-        alt_msl_m = geodesy.msl_m(frame, frame.alt_m - float(self._world.position_m[slot, 2]))
-        time_s = self._world.time_s
+        alt_msl_m, time_s = self._altitude_msl_m(slot), self._world.time_s
+        if self._barometers:
+            alt_msl_m = self._barometers[slot].altitude_m(alt_msl_m, time_s)
         force = self._imu[slot].accel(self._body_force[slot], time_s)
         return SensedImu(
             time_s,
             self._faults.force(self._scenario.ids[slot], time_s, force),
             self._imu[slot].gyro(self._body_rates[slot]),
             self._body_field[slot],
-            pressure_hpa(alt_msl_m),
+            pressure_hpa(alt_msl_m) if self._barometers else None,
             alt_msl_m,
         )
+
+    def _altitude_msl_m(self, slot: int) -> float:
+        frame = self._scenario.frame
+        return float(geodesy.msl_m(frame, frame.alt_m - float(self._world.position_m[slot, 2])))
 
     def attitude(self, slot: int) -> SensedAttitude:
         """What the autopilot of one vehicle takes for its attitude."""

@@ -18,6 +18,7 @@ from estimators.model.measurements import (
     anchor_range_row,
     empty_inputs,
     empty_rows,
+    height_row,
     input_rows,
     position_rows,
     range_row,
@@ -70,6 +71,8 @@ def row_of(
         return speed_row(tick, agent, 0.0, variance, offset_s=offset_s)
     if kind is Kind.ANCHOR_RANGE:
         return anchor_range_row(tick, agent, 20.0 * direction, 0.0, variance, offset_s=offset_s)
+    if kind is Kind.HEIGHT:
+        return height_row(tick, agent, 0.0, variance, offset_s=offset_s, drifts=bool(rng.random() < 0.7))
     other = int((agent + rng.integers(1, agents)) % agents)
     return range_row(tick, agent, other, 0.0, variance, offset_s=offset_s)
 

@@ -46,6 +46,8 @@ def predicted_row(row: np.void, x: Array, eps: float) -> float:
     p, v = x[6 * a : 6 * a + 3], x[6 * a + 3 : 6 * a + 6]
     if row["kind"] == Kind.POSITION:
         return float(direction @ (p + o * v))
+    if row["kind"] == Kind.HEIGHT:
+        return float(p[2] + o * v[2])
     if row["kind"] == Kind.VELOCITY:
         return float(direction @ v)
     if row["kind"] == Kind.SPEED:
@@ -76,6 +78,9 @@ def jacobian(rows: RowTable, x: Array, eps: float) -> Array:
             out[r, v] = x[v] / np.sqrt(x[v] @ x[v] + eps**2)
         elif row["kind"] == Kind.POSITION:
             out[r, p], out[r, v] = direction, o * direction
+        elif row["kind"] == Kind.HEIGHT:
+            down = np.array([0.0, 0.0, 1.0])
+            out[r, p], out[r, v] = down, o * down
         elif row["kind"] == Kind.ANCHOR_RANGE:
             away = x[p] + o * x[v] - direction
             unit = away / np.sqrt(away @ away + eps**2)

@@ -72,6 +72,8 @@ def _predicted(casadi: Any, row: np.void, x: Any, eps: float) -> Any:
     match Kind(int(row["kind"])):
         case Kind.POSITION:
             return casadi.dot(direction, place)
+        case Kind.HEIGHT:
+            return place[2]
         case Kind.VELOCITY:
             return casadi.dot(direction, velocity)
         case Kind.SPEED:

@@ -32,6 +32,9 @@ def coupling_matrix(rows: RowTable, agents: int) -> Array:
         if row["kind"] == Kind.POSITION:
             out[r, slow_errors.wander_of(int(row["agent"]))] = direction
             out[r, slow_errors.common(agents)] = direction
+        elif row["kind"] == Kind.HEIGHT:
+            out[r, slow_errors.drifts(agents).start + int(row["agent"])] = row["x"]
+            out[r, slow_errors.scales(agents).start + int(row["agent"])] = row["x"] * row["value"]
         elif row["kind"] == Kind.RANGE:
             out[r, slow_errors.pair_of(int(row["agent"]), int(row["other"]), agents)] = 1.0
     return out

@@ -7,7 +7,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from estimators.model.measurements import InputTable, RowTable, empty_inputs, input_rows, position_rows, range_row
+from estimators.model.measurements import (
+    InputTable,
+    RowTable,
+    empty_inputs,
+    height_row,
+    input_rows,
+    position_rows,
+    range_row,
+)
 from estimators.model.measurements import velocity_rows as velocity_rows_of
 from estimators.systematic.slow_errors import ACCELERATION_S, PAIR_S, WANDER_S
 from tests.support import builders
@@ -34,6 +42,12 @@ class World:
     """Slow error of accelerations."""
     pair_m: float = 0.0
     """Bias of ranges."""
+    drift_m: float | None = None
+    """What barometers are off by at first, and how far they drift in an hour; absent = there are none."""
+    scale: float = 0.0
+    """Of their heights, per metre."""
+    baro_m: float = 0.2
+    """Their white noise."""
     accel_noise_mps2: float = 0.3
     velocity_mps: float = 0.1
     range_m: float = 0.1
@@ -78,6 +92,7 @@ def fly(world: World, ticks: int, rng: np.random.Generator) -> WanderingFlight:
     bias = world.pair_m * gauss_markov(rng, ticks + 1, (n, n), np.exp(-dt / PAIR_S))
     claim, speed, length = world.claim_m**2, world.velocity_mps**2, world.range_m**2
     rows, inputs = [], []
+    height = None if world.drift_m is None else _barometers(world, states[:, :, 0, 2], rng.spawn(1)[0])
     said = accel.reshape(ticks, n, 3) + push[:-1] + world.accel_noise_mps2 * rng.normal(size=(ticks, n, 3))
     for k in range(ticks + 1):
         tables = []
@@ -86,6 +101,8 @@ def fly(world: World, ticks: int, rng: np.random.Generator) -> WanderingFlight:
             tables.append(position_rows(k, a, fix, np.full(3, claim)))
             measured = states[k, a, 1] + world.velocity_mps * rng.normal(size=3)
             tables.append(velocity_rows_of(k, a, measured, np.full(3, speed)))
+            if height is not None:
+                tables.append(height_row(k, a, float(height[k, a]), world.baro_m**2, drifts=True))
             for b in range(n):
                 if a < b:
                     away = float(np.linalg.norm(states[k, a, 0] - states[k, b, 0]))
@@ -100,3 +117,13 @@ def fly(world: World, ticks: int, rng: np.random.Generator) -> WanderingFlight:
     return WanderingFlight(
         np.array(truth), rows, inputs, said.reshape(ticks, 3 * n), np.full((ticks, 3 * n), world.accel_noise_mps2**2)
     )
+
+
+def _barometers(world: World, down_m: Array, rng: np.random.Generator) -> Array:
+    """What the barometers say ``(T+1, n)``, at true heights NED."""
+    assert world.drift_m is not None
+    ticks, n = down_m.shape
+    step_m = world.drift_m * np.sqrt(world.period_s / 3600.0)
+    drift = world.drift_m * rng.normal(size=n) + np.cumsum(step_m * rng.normal(size=(ticks, n)), axis=0)
+    scale = 1.0 + world.scale * rng.normal(size=n)
+    return np.asarray(scale * down_m + drift + world.baro_m * rng.normal(size=(ticks, n)))

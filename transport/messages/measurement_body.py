@@ -74,6 +74,8 @@ class MeasurementKind(IntEnum):
     ORIENTATION = 7
     TAG_RANGE = 8
     ANTENNA_SPEED = 9
+    HEIGHT = 10
+    GROUND_HEIGHT = 11
 
 
 _Floats = tuple[float, ...]
@@ -240,6 +242,28 @@ class AnchorRangeMeasurement(_Record):
 
 
 @dataclass(frozen=True)
+class HeightMeasurement(_Record):
+    """The height of ``observer`` by its barometer: NED m, with drift and scale that its variance leaves out."""
+
+    kind = MeasurementKind.HEIGHT
+    limit = MAX_POSITION_M
+
+    down_m: float
+    variance_m2: float
+    offset_s: float = 0.0
+
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s,), (self.down_m,), (self.variance_m2,), ())
+
+
+@dataclass(frozen=True)
+class GroundHeightMeasurement(HeightMeasurement):
+    """The height of ``observer`` by what it measures to known ground: NED m, with no error but noise."""
+
+    kind = MeasurementKind.GROUND_HEIGHT
+
+
+@dataclass(frozen=True)
 class AccelerationMeasurement(_Record):
     """The acceleration of ``observer`` averaged over ``tick`` to ``tick + 1``: NED m/s2, gravity removed."""
 
@@ -276,6 +300,7 @@ Measurement = (
     | SpeedMeasurement
     | RangeMeasurement
     | AnchorRangeMeasurement
+    | HeightMeasurement
     | AccelerationMeasurement
     | OrientationMeasurement
 )
@@ -290,6 +315,12 @@ _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.ORIENTATION: struct.Struct("<BHB3e3e"),
     MeasurementKind.TAG_RANGE: struct.Struct("<BHBfHBfee"),
     MeasurementKind.ANTENNA_SPEED: struct.Struct("<BHBff3eee"),
+    MeasurementKind.HEIGHT: struct.Struct("<BHBffe"),
+    MeasurementKind.GROUND_HEIGHT: struct.Struct("<BHBffe"),
+}
+_HEIGHTS: dict[int, type[HeightMeasurement]] = {
+    MeasurementKind.HEIGHT: HeightMeasurement,
+    MeasurementKind.GROUND_HEIGHT: GroundHeightMeasurement,
 }
 _AGE_AT = 3
 """Where the age stands in a record."""
@@ -506,6 +537,9 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
         velocity = _triple(_bounded(fields[4:7], MAX_SPEED_MPS, "velocity"))
         variance = _triple(_variances(fields[7:10]))
         return VelocityMeasurement(observer, tick, velocity, variance, _triple(_widths(fields[10:13])), offset)
+    if kind in _HEIGHTS:
+        down_m = _bounded(fields[4:5], MAX_POSITION_M, "height")[0]
+        return _HEIGHTS[kind](observer, tick, down_m, _variances(fields[5:])[0], offset)
     sigma, half_width = _variances(fields[-2:-1])[0], _widths(fields[-1:])[0]
     if kind == MeasurementKind.SPEED:
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]

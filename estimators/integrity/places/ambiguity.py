@@ -217,7 +217,7 @@ class AmbiguityMonitor:
     def _advance(self, mixture: Mixture, evidence: DroneEvidence) -> None:
         """Move to this tick and use its rows other than ranges."""
         rows = evidence.rows
-        linear = rows[(rows["kind"] == Kind.POSITION) | (rows["kind"] == Kind.VELOCITY)]
+        linear = rows[np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.HEIGHT))]
         before, self._drift = self._drift, evidence.drift
         predict(mixture, evidence.accel, evidence.accel_variance, self._period_s, evidence.drift)
         if before is not None and evidence.drift is not None:  # an attitude that tilts does so at once
@@ -369,7 +369,7 @@ def rows_of(rows: RowTable, slot: int) -> RowTable:
 
 
 def _slope(row: np.void) -> Vector:
-    direction = np.array([row["x"], row["y"], row["z"]])
+    direction = np.array([row["x"], row["y"], row["z"]] if row["kind"] != Kind.HEIGHT else [0.0, 0.0, 1.0])
     if row["kind"] == Kind.VELOCITY:
         return np.concatenate([np.zeros(3), direction])
     return np.concatenate([direction, float(row["offset_s"]) * direction])

@@ -23,7 +23,16 @@ from pathlib import Path
 from typing import Any, Literal, Protocol
 
 from agent.sensing.frames import FleetFrame
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Quaternion, Triple
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    Quaternion,
+    Triple,
+)
 
 Format = Literal["tlog", "dataflash", "ulog"]
 Flavour = Literal["px4", "ardupilot", "other", "unknown"]
@@ -57,7 +66,7 @@ class TruthSample:
     has_height: bool = True
 
 
-LogSample = ImuSample | AttitudeSample | GpsSample | AutopilotEstimate | TruthSample
+LogSample = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | AutopilotEstimate | TruthSample
 """Samples on log time. An `AutopilotEstimate` of a log is in the frame that `SystemSurvey.estimate_frame` says:
 the fleet's, unless the log does not tell where the autopilot's own origin is."""
 
@@ -65,6 +74,8 @@ KINDS: dict[type, str] = {
     ImuSample: "imu",
     AttitudeSample: "attitude",
     GpsSample: "gps",
+    BaroSample: "baro",
+    GroundSample: "ground",
     AutopilotEstimate: "autopilot estimate",
     TruthSample: "truth",
 }

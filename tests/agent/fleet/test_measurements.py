@@ -18,18 +18,23 @@ from agent.fleet.measurements import (
     acceleration_measurement,
     anchor_measurement,
     gps_measurements,
+    height_measurement,
     inputs_of,
     range_measurement,
     rows_of,
 )
-from agent.sensing.samples import GpsSample, RangeSample
+from agent.sensing.barometer import SIGMA_M
+from agent.sensing.samples import BaroSample, GpsSample, RangeSample
 from agent.sensing.timeline import TickInput
 from estimators.model import measurements
 from estimators.model.measurements import Kind
+from tests.agent.conftest import fleet_config
 from tests.support.holding import held
 from transport.messages.measurement_body import (
     AccelerationMeasurement,
     AnchorRangeMeasurement,
+    GroundHeightMeasurement,
+    HeightMeasurement,
     Measurement,
     PositionMeasurement,
     RangeMeasurement,
@@ -63,6 +68,25 @@ def test_a_fix_becomes_rows_at_its_own_instant_with_the_receivers_accuracy() -> 
 def test_the_variance_of_wandering_fixes_is_raised_by_its_factor() -> None:
     rows = rows_of(gps_measurements(2, fix(), 0.1, SensorsTable(gps_variance_factor=20.0))[:1], SLOTS)
     assert rows["variance"] == pytest.approx([5.0, 5.0, 12.8])
+
+
+def test_a_height_becomes_a_row_down_at_its_own_instant() -> None:
+    record = height_measurement(2, BaroSample(10.03, 12.5), 0.1)
+    (row,) = rows_of([record], SLOTS)
+    assert (row["tick"], row["offset_s"]) == (100, pytest.approx(0.03))
+    assert (row["kind"], row["agent"], row["other"], row["value"], row["x"]) == (Kind.HEIGHT, 1, -1, -12.5, 1.0)
+    assert row["variance"] == pytest.approx(SIGMA_M**2)
+    (level,) = rows_of([GroundHeightMeasurement(2, 100, -12.5, 0.01)], SLOTS)
+    assert (level["kind"], level["x"]) == (Kind.HEIGHT, 0.0)
+
+
+@pytest.mark.parametrize(("known", "taken"), [("true", 2), ("false", 1)])
+def test_heights_that_drift_are_not_for_an_estimator_without_slow_errors(known: str, taken: int) -> None:
+    store = MeasurementStore(fleet_config(2, f"estimator.systematic_errors={known}"), 1)
+    store.neighbourhood.hear(2, 100)
+    heights = [HeightMeasurement(2, 100, -12.5, 0.1), GroundHeightMeasurement(2, 100, -12.5, 0.1)]
+    assert len(store.add_heard(2, heights, 100)) == taken
+    assert store.refused["heard: not used"] == 2 - taken
 
 
 def test_configured_half_widths_set_variance_and_bound() -> None:

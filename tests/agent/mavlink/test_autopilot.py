@@ -127,6 +127,18 @@ def test_raw_imu_is_asked_for_where_highres_imu_is_refused(bench: Callable[..., 
     assert mavlink.MAVLINK_MSG_ID_SCALED_IMU in [message_id for message_id, _ in px4.autopilot.commands]
 
 
+@pytest.mark.parametrize(("barometer", "asked"), [("true", True), ("false", False)])
+def test_pressure_is_asked_for_where_highres_imu_does_not_bring_it(
+    bench: Callable[..., Bench], barometer: str, asked: bool
+) -> None:
+    lacking = bench(f"sensors.barometer={barometer}", autopilot=ARDUPILOT, refuses=(HIGHRES,))
+    lacking.run(8)
+    assert (mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE in dict(lacking.autopilot.commands)) is asked
+    having = bench(f"sensors.barometer={barometer}")
+    having.run(8)
+    assert mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE not in dict(having.autopilot.commands)
+
+
 def test_requests_without_answer_are_repeated_three_times_and_then_the_next_is_tried(
     bench: Callable[..., Bench],
 ) -> None:

@@ -14,7 +14,7 @@ from agent.config.tables import FleetConfig, SensorsTable
 from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.sensing.frames import FleetFrame, rotated
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
 
 FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
 EPOCH_UNIX_S = 1_767_225_600.0
@@ -88,6 +88,41 @@ def test_raw_imu_serves_only_while_highres_imu_is_silent() -> None:
     assert convert(made, highres()) is not None
     assert convert(made, raw_imu()) is None
     assert convert(made, raw_imu(101_000_000), ARRIVAL_S + 1.1) is not None
+
+
+def pressure(hpa: float = 954.61, second: bool = False, time_boot_ms: int = 99_990) -> Any:
+    kind = mavlink.MAVLink_scaled_pressure2_message if second else mavlink.MAVLink_scaled_pressure_message
+    return kind(time_boot_ms, hpa, 0.0, 3500)
+
+
+def test_scaled_pressure_is_in_hectopascals_and_gives_metres_at_its_own_instant() -> None:
+    sample = convert(adapter(), pressure())
+    assert isinstance(sample, BaroSample)
+    assert sample.t_s == pytest.approx(499.99)
+    assert sample.altitude_m == pytest.approx(500.0, abs=0.3)
+
+
+def test_highres_imu_holds_a_barometer_beside_the_imu() -> None:
+    made = adapter()
+    sample = made.pressure_beside(through_the_wire(highres()), ARRIVAL_S)
+    assert isinstance(sample, BaroSample)
+    assert (sample.t_s, sample.altitude_m) == (pytest.approx(499.99), pytest.approx(540.3, abs=0.5))
+    # of which nothing is new, or that is of another IMU
+    assert made.pressure_beside(through_the_wire(highres(fields=0x1FFF & ~0x200)), ARRIVAL_S) is None
+    assert made.pressure_beside(through_the_wire(highres(number=1)), ARRIVAL_S) is None
+    assert made.pressure_beside(through_the_wire(pressure()), ARRIVAL_S) is None
+    assert made.received["baro"] == 1
+    # while it comes, the same sensor's own message is the lesser one
+    assert convert(made, pressure(), ARRIVAL_S + 0.1) is None
+    assert convert(made, pressure(time_boot_ms=101_500), ARRIVAL_S + 1.6) is not None
+
+
+@pytest.mark.parametrize("hpa", [0.0, math.nan, 99.0, 1300.0])
+def test_what_is_no_pressure_of_air_is_no_sample(hpa: float) -> None:
+    made = adapter()
+    assert convert(made, pressure(hpa)) is None
+    assert made.skipped == {"baro: no pressure of air": 1}
+    assert convert(made, pressure(second=True)) is not None  # and a second barometer takes its place
 
 
 def test_second_imus_and_frames_without_new_data_are_left_out() -> None:

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from estimators.model.measurements import Kind, RowTable, position_rows
+from estimators.model.measurements import Kind, RowTable, height_row, position_rows
 from estimators.systematic import slow_errors
 from tests.support import builders
 from tests.support.joint_reference import coupling_matrix
@@ -48,6 +48,8 @@ def test_every_error_has_one_place(agents: int) -> None:
     for one, other in combinations(range(agents), 2):
         places[slow_errors.pair_of(one, other, agents)] += 1
         assert slow_errors.pair_of(one, other, agents) == slow_errors.pair_of(other, one, agents)
+    places[slow_errors.drifts(agents)] += 1
+    places[slow_errors.scales(agents)] += 1
     assert (places == 1).all()
     pairs = np.zeros(len(places), int)
     pairs[slow_errors.pairs(agents)] += 1
@@ -89,13 +91,17 @@ def test_who_stayed_keeps_his_errors_and_others_begin_anew(data: st.DataObject, 
         was[slow_errors.common(after)], np.arange(slow_errors.count(before))[slow_errors.common(before)]
     )
     for slot in range(after):
-        here = was[slow_errors.wander_of(slot)], was[slow_errors.acceleration_of(slot, after)]
+        drift, scale = slow_errors.drifts(after).start + slot, slow_errors.scales(after).start + slot
+        barometer = was[[drift, scale]]
+        here = was[slow_errors.wander_of(slot)], was[slow_errors.acceleration_of(slot, after)], barometer
         if slot not in stayed:
             assert (np.concatenate(here) == -1).all()
             continue
         places = np.arange(slow_errors.count(before))
         np.testing.assert_array_equal(here[0], places[slow_errors.wander_of(stayed[slot])])
         np.testing.assert_array_equal(here[1], places[slow_errors.acceleration_of(stayed[slot], before)])
+        assert barometer[0] == slow_errors.drifts(before).start + stayed[slot]
+        assert barometer[1] == slow_errors.scales(before).start + stayed[slot]
     for one, other in combinations(range(after), 2):
         both = one in stayed and other in stayed
         expected = slow_errors.pair_of(stayed[one], stayed[other], before) if both else -1
@@ -133,3 +139,14 @@ def test_errors_decay_by_their_time_constants(period_s: float) -> None:
     assert kept[slow_errors.acceleration_of(1, 2)] == pytest.approx(np.exp(-period_s / slow_errors.ACCELERATION_S))
     assert kept[slow_errors.common(2)] == pytest.approx(np.exp(-period_s / slow_errors.WANDER_S))
     assert kept[slow_errors.pairs(2)] == pytest.approx(np.exp(-period_s / slow_errors.PAIR_S))
+    assert kept[slow_errors.drifts(2)] == pytest.approx(np.exp(-period_s / slow_errors.HEIGHT_S))
+    assert kept[slow_errors.scales(2)] == pytest.approx(np.exp(-period_s / slow_errors.HEIGHT_S))
+
+
+def test_a_barometer_holds_its_drift_and_its_scale_by_the_height_and_a_range_finder_neither() -> None:
+    rows = builders.joined([height_row(0, 1, -40.0, 0.1, drifts=True), height_row(0, 1, -40.0, 0.1, drifts=False)])
+    held = dense_couplings(rows, 3)
+    assert held[0, slow_errors.drifts(3)].tolist() == [0.0, 1.0, 0.0]
+    assert held[0, slow_errors.scales(3)].tolist() == [0.0, -40.0, 0.0]
+    assert np.count_nonzero(held[0]) == 2
+    assert not held[1].any()

@@ -185,3 +185,57 @@ def test_it_is_consistent_where_sensors_wander(wander_m: float, white: float, le
     if wander_m > 1.0:
         without = msgspec.structs.replace(default_settings(), systematic_errors=False)
         assert consistency(world, without, range(4), 200, 100)[0] > 10.0
+
+
+# --- barometers -------------------------------------------------------------------------------------------------
+
+DRIFTING = replace(WORLD, wander_m=0.8, white=0.4, drift_m=3.0, scale=0.04)
+"""Barometers as the estimator takes them to be: by its prior and time constant they walk 3 m in an hour."""
+BLIND_FROM = 100
+
+
+def blind_heights(world: World, seeds: range, ticks: int) -> tuple[float, float]:
+    """NEES of the height of a drone without fixes from `BLIND_FROM` on, and its RMSE m, over the seeds."""
+    squares, errors = [], []
+    for seed in seeds:
+        rng = np.random.default_rng([seed, 78])
+        flight = fly(world, ticks, rng)
+        for tick in range(BLIND_FROM, ticks + 1):
+            rows = flight.rows[tick]
+            fix = (rows["agent"] == 2) & np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY))
+            flight.rows[tick] = rows[~fix]
+        start = flight.truth[0] + rng.normal(0.0, np.tile([2.0, 2.0, 2.0, 1.0, 1.0, 1.0], world.agents))
+        estimates = estimated(flight, default_settings(), start, world)
+        for tick in range(BLIND_FROM + 25, ticks + 1, 5):
+            away = estimates[tick].mean[14] - flight.truth[tick][14]
+            squares.append(away**2 / estimates[tick].covariance[14, 14])
+            errors.append(away**2)
+    return float(np.mean(squares)), float(np.sqrt(np.mean(errors)))
+
+
+@pytest.mark.parametrize(("offset_m", "pulled_m"), [(0.0, 1e-3), (7.0, 0.05)])
+def test_heights_without_noise_are_what_they_are(offset_m: float, pulled_m: float) -> None:
+    # GIVEN perfect sensors, and barometers that are off, and that alone
+    exact = World(
+        agents=2, period_s=0.2, claim_m=0.5, white=0.0, velocity_mps=0.0, range_m=0.0, accel_noise_mps2=0.0,
+        drift_m=0.0, baro_m=0.0,
+    )  # fmt: skip
+    flight = fly(exact, 60, np.random.default_rng(4))
+    for table in flight.rows:
+        table["variance"] = np.maximum(table["variance"], 1e-4)
+        table["value"][table["kind"] == Kind.HEIGHT] += offset_m
+    for table in flight.inputs:
+        table["variance"] = 1e-4
+    estimates = estimated(flight, EXACT, flight.truth[0], exact)
+    # THEN they take nothing away from the truth, but for what the prior of the offset pulls
+    for tick in range(30, 61, 10):
+        np.testing.assert_allclose(estimates[tick].mean, flight.truth[tick], rtol=0, atol=pulled_m)
+
+
+@pytest.mark.slow
+def test_a_barometer_holds_the_height_of_a_blind_drone_as_well_as_the_estimate_says() -> None:
+    # GIVEN receivers that wander, barometers with offset, drift and scale, and a drone without fixes for 30 s
+    anees, rmse_m = blind_heights(DRIFTING, range(12), 250)
+    # THEN its height is better than without, and the estimate knows how good it is
+    assert 0.25 < anees < 1.7  # of twelve flights whose errors last as long as they do
+    assert rmse_m < 0.8 * blind_heights(replace(DRIFTING, drift_m=None), range(12), 250)[1]

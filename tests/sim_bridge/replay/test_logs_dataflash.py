@@ -12,7 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
 from sim_bridge.replay.logs.dataflash.records import FMT_BYTES, HEAD, LONGEST_RECORD_BYTES, RecordReader
 from sim_bridge.replay.logs.dataflash.source import CONFIRM_RECORDS
 from sim_bridge.replay.logs.events import LogError, TruthSample
@@ -86,6 +86,31 @@ def test_records_become_samples_in_si_and_the_fleets_frame(tmp_path: Path) -> No
     assert (fix.horizontal_sigma_m, fix.vertical_sigma_m, fix.speed_sigma_mps) == pytest.approx((0.7, 0.9, 0.2))
     assert fix.ground_velocity_mps == pytest.approx((2.0, 0.0))
     assert fix.latency.source == "ardupilot boot"
+
+
+@pytest.mark.parametrize(
+    ("second", "labels", "first"),
+    [("BARO", "TimeUS,I,Alt,Press", (0,)), ("BAR2", "TimeUS,Alt,Press", ())],
+    ids=["numbered", "of its own name"],
+)
+def test_the_first_barometer_gives_altitudes_of_its_pressure(
+    tmp_path: Path, second: str, labels: str, first: tuple[int, ...]
+) -> None:
+    # GIVEN two barometers, whose heights are above the ground, in either layout
+    form, number = "QBff" if first else "Qff", (1,) if first else ()
+    described = fmt(120, "BARO", form, labels) + (fmt(121, second, form, labels) if not first else b"")
+    kind = 120 if first else 121
+    told = b"".join(
+        entry(120, form, us, *first, 3.0, 95_461.0) + entry(kind, form, us, *number, 3.0, 90_000.0)
+        for us in range(34_000_000, 35_100_000, 100_000)
+    )
+    path = tmp_path / "a.BIN"
+    path.write_bytes(flight() + described + told)
+    source, events = read(path)
+    heights = [event.sample for event in events if isinstance(event.sample, BaroSample)]
+    assert [sample.t_s for sample in heights[:10]] == pytest.approx([34.0 + 0.1 * k for k in range(10)], abs=1e-6)
+    assert {round(sample.altitude_m) for sample in heights} == {500}
+    assert source.counts.skipped["baro: not the first one"] == 11
 
 
 def test_attitude_is_body_to_ned(tmp_path: Path) -> None:

@@ -14,9 +14,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
 from sim_bridge.replay.logs.events import LogError, TruthSample
-from sim_bridge.replay.logs.ulog.tables import MAGIC, Unpacked, in_order
+from sim_bridge.replay.logs.ulog.samples import baro_samples, barometer_table
+from sim_bridge.replay.logs.ulog.tables import MAGIC, TopicTable, Unpacked, in_order
 from tests.support.logs import FRAME, check_refusal, read
 
 pytest.importorskip("pyulog", reason="the extra [ulog] is not installed")
@@ -146,6 +147,33 @@ def test_unix_time_by_receiver_or_companion(tmp_path: Path, utc: bool, timesync:
         assert unix.at(11.0) == pytest.approx(1_795_000_011.0, abs=1e-3)
     if known_by == "gps":  # the fix of 11.0 s is published, and stamped, 50 ms later
         assert unix.at(11.05) == pytest.approx(1_795_000_011.0, abs=1e-3)
+
+
+@pytest.mark.parametrize(
+    ("name", "field", "pressure"),
+    [
+        ("vehicle_air_data", "baro_pressure_pa", 95_461.0),
+        ("sensor_baro", "pressure", 95_461.0),
+        ("sensor_baro", "pressure", 954.61),  # before PX4 1.14
+    ],
+)
+def test_barometers_in_pascals_and_hectopascals(name: str, field: str, pressure: float) -> None:
+    stamps = np.arange(1_000_000, 1_500_000, 100_000, dtype=np.int64)
+    columns = {field: np.array([pressure, pressure, np.nan, 0.0, pressure]), "timestamp_sample": stamps - 20_000}
+    skipped: Counter[str] = Counter()
+    taken = list(baro_samples(TopicTable(name, stamps, columns), skipped))
+    assert [arrival_s for arrival_s, _ in taken] == pytest.approx([1.0, 1.1, 1.4])
+    samples = [sample for _, sample in taken if isinstance(sample, BaroSample)]
+    assert [sample.t_s for sample in samples] == pytest.approx([0.98, 1.08, 1.38])
+    assert [sample.altitude_m for sample in samples] == pytest.approx([500.0] * 3, abs=0.3)
+    assert skipped == {"baro: no pressure of air": 2}
+
+
+def test_the_barometer_that_the_autopilot_chose_is_listened_to() -> None:
+    tables = {name: TopicTable(name, np.zeros(1, np.int64), {}) for name in ("sensor_baro", "vehicle_air_data")}
+    assert barometer_table(tables) is tables["vehicle_air_data"]
+    assert barometer_table({"sensor_baro": tables["sensor_baro"]}) is tables["sensor_baro"]
+    assert barometer_table({}) is None
 
 
 @given(st.lists(st.integers(0, 10**9), max_size=60))

@@ -7,11 +7,12 @@ import math
 import numpy as np
 import pytest
 
+from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame
 from sim_bridge.faults.fault_tables import GpsWrong
-from sim_bridge.world import quaternions
+from sim_bridge.world import geodesy, quaternions
 from sim_bridge.world.guidance import Waypoints
-from sim_bridge.world.noise import PAPER, REALISTIC, GaussMarkov, GpsNoise, UwbNoise
+from sim_bridge.world.noise import NOM, PAPER, REALISTIC, GaussMarkov, GpsNoise, UwbNoise
 from sim_bridge.world.scenario import Interval, Vehicle
 from sim_bridge.world.simulation import Simulation
 
@@ -243,3 +244,25 @@ def test_antennas_are_where_the_attitude_turns_their_arms(make_scenario):
     assert set(seen) == {0, 1}
     yaw = [float(world_yaw) for world_yaw in simulation.world.yaw_rad]
     assert yaw == pytest.approx([1.0, 1.0])
+
+
+def test_a_barometer_is_off_by_its_offset_and_its_noise(make_scenario):
+    # GIVEN drones that stay about where they are, with and without barometers
+    bare = Simulation(make_scenario(*THREE, profile="paper"), 0.0)
+    bare.world.step()
+    assert bare.sensors.imu(0).pressure_hpa is None
+    simulation = Simulation(make_scenario(*THREE, profile="nom", seed=3), 0.0)
+    frame = make_scenario().frame
+    errors = [[], [], []]
+    for world in each_step(simulation, 20.0):
+        for slot in range(3):
+            said = simulation.sensors.imu(slot)
+            true_m = geodesy.msl_m(frame, frame.alt_m - world.position_m[slot, 2])
+            errors[slot].append(said.pressure_alt_m - true_m)
+            # and the pressure is that of the altitude, as the daemon reads it
+            assert pressure_altitude_m(said.pressure_hpa) == pytest.approx(said.pressure_alt_m, abs=0.05)
+    # THEN each is off by metres of its own, and scatters about that
+    means = np.mean(errors, axis=1)
+    assert np.ptp(means) > 0.5
+    assert np.abs(means).max() < 15.0
+    assert np.diff(errors, axis=1).std() / math.sqrt(2.0) == pytest.approx(NOM.barometer.sigma_m, rel=0.1)

@@ -17,6 +17,8 @@ from transport.messages.measurement_body import (
     AccelerationMeasurement,
     AnchorRangeMeasurement,
     AntennaSpeedMeasurement,
+    GroundHeightMeasurement,
+    HeightMeasurement,
     Measurement,
     MeasurementKind,
     Measurements,
@@ -72,9 +74,12 @@ antenna_speeds = st.builds(
     AntennaSpeedMeasurement, ids, ticks, numbers(1e4), variances, widths, offsets, triples(numbers(60.0))
 )
 orientations = st.builds(OrientationMeasurement, ids, ticks, triples(numbers(3.2)), triples(numbers(60.0)))
+heights = st.builds(HeightMeasurement, ids, ticks, numbers(1e6), variances, offsets)
+ground_heights = st.builds(GroundHeightMeasurement, ids, ticks, numbers(1e6), variances, offsets)
 records = st.one_of(
-    positions, velocities, speeds, ranges, anchors, accelerations, tag_ranges, antenna_speeds, orientations
-)
+    positions, velocities, speeds, ranges, anchors, accelerations, tag_ranges, antenna_speeds, orientations, heights,
+    ground_heights,
+)  # fmt: skip
 
 RANGE = RangeMeasurement(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
 SPEED = SpeedMeasurement(1, TICK, 1.5, 0.04)

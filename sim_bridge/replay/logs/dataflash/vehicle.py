@@ -13,9 +13,10 @@ from collections.abc import Callable
 
 from agent.config.tables import SensorsTable
 from agent.mavlink.boot_times import WRAP_MS_S
+from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.receivers import ReceiverChoice
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Triple
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample, Triple
 from sim_bridge.replay.logs.dataflash.records import Values
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
@@ -28,6 +29,7 @@ WANTED: dict[str, tuple[str, ...]] = {
     "ORGN": ("TimeUS", "Type", "Lat", "Lng", "Alt"),
     **dict.fromkeys(("IMU", "IMU2", "IMU3"), _IMU),
     "ATT": ("TimeUS", "Roll", "Pitch", "Yaw"),
+    **dict.fromkeys(("BARO", "BAR2", "BAR3"), ("TimeUS", "I", "Press")),
     **dict.fromkeys(("GPS", "GPS2"), _GPS),
     **dict.fromkeys(("GPA", "GPA2"), _GPA),
     "XKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
@@ -36,7 +38,10 @@ WANTED: dict[str, tuple[str, ...]] = {
     "SIM": ("TimeUS", "Lat", "Lng", "Alt", "Q1", "Q2", "Q3", "Q4"),
     "SIM2": ("TimeUS", "PN", "PE", "PD", "VN", "VE", "VD"),
 }
-_NUMBERED = {"IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "GPS2": ("GPS", 1), "GPA2": ("GPA", 1)}
+_NUMBERED = {
+    "IMU2": ("IMU", 1), "IMU3": ("IMU", 2), "GPS2": ("GPS", 1), "GPA2": ("GPA", 1), "BAR2": ("BARO", 1),
+    "BAR3": ("BARO", 2),
+}  # fmt: skip
 """Before the field ``I`` came, each further sensor had a record of its own."""
 SAME_INSTANT_S = 0.005
 """Records of one loop of the autopilot are stamped this close."""
@@ -158,6 +163,7 @@ class DataflashVehicle:
         self._converters: dict[str, Callable[[Values, float], LogSample | None]] = {
             "IMU": self._imu,
             "ATT": self._attitude,
+            "BARO": self._barometer,
             "XKF4": self._primary_lane,
             "ORGN": self._origin,
             "XKF1" if system.messages.get("XKF1") else "NKF1": self._estimate,
@@ -179,6 +185,9 @@ class DataflashVehicle:
         name, number = instance_of(name, values)
         if name == "IMU" and number != self._imu_number:
             self._skip("imu: not the first one")
+            return made
+        if name == "BARO" and number:
+            self._skip("baro: not the first one")
             return made
         converter = self._converters.get(name)
         if converter is not None:
@@ -204,6 +213,11 @@ class DataflashVehicle:
         if not all(map(math.isfinite, angles)) or max(map(abs, angles)) > 720.0:
             return self._skip("attitude: not finite or out of range")
         return AttitudeSample(t_s, from_euler(*map(math.radians, angles)))
+
+    def _barometer(self, values: Values, t_s: float) -> LogSample | None:
+        """BARO: the pressure in Pa. Its heights are above where the autopilot was armed."""
+        altitude_m = pressure_altitude_m(values["Press"])
+        return self._skip("baro: no pressure of air") if altitude_m is None else BaroSample(t_s, altitude_m)
 
     def _gps(self, values: Values, now_s: float, receiver: int) -> LogSample | None:
         point = point_of(values)

@@ -156,8 +156,7 @@ class TlogSource(SurveyedLog):
                         vehicle.on_boot_time(boot_s, arrival_s, wrap_s)
                     if message_id not in vehicle.wanted:
                         continue
-                    sample = vehicle.sample(message_id, decoded(message_id, payload), arrival_s)
-                    if sample is not None:
+                    for sample in vehicle.samples(message_id, decoded(message_id, payload), arrival_s):
                         event = LogEvent(arrival_s, source[0], sample)
                         counts.count(event)
                         yield event

@@ -17,7 +17,7 @@ from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.components import SENSORS
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.sensing.frames import FleetFrame, from_euler, normalised
-from agent.sensing.samples import AutopilotEstimate, Quaternion, RangeSample, Triple
+from agent.sensing.samples import AutopilotEstimate, BaroSample, Quaternion, RangeSample, Triple
 from sim_bridge.replay.logs.boot_clock import LogBootClock
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 
@@ -71,7 +71,7 @@ class LoggedVehicle:
         return self._adapter.noted
 
     def on_boot_time(self, boot_s: float, arrival_s: float, wrap_s: float) -> None:
-        """Note the boot time that a message shows, before its `sample` is asked for; it wraps after ``wrap_s``."""
+        """Note the boot time that a message shows, before its `samples` are asked for; it wraps after ``wrap_s``."""
         self._boot = (boot_s, arrival_s, wrap_s)
         session = self._clock.session(arrival_s)
         if session != self._session:
@@ -79,8 +79,14 @@ class LoggedVehicle:
                 self._adapter.reset()
             self._session = session
 
-    def sample(self, message_id: int, message: Message, arrival_s: float) -> LogSample | None:
-        """The sample of one of the `wanted` messages."""
+    def samples(self, message_id: int, message: Message, arrival_s: float) -> list[LogSample]:
+        """The samples of one of the `wanted` messages."""
+        beside = self._adapter.pressure_beside(message, arrival_s)
+        assert beside is None or isinstance(beside, BaroSample)
+        both = self._sample(message_id, message, arrival_s), beside
+        return [sample for sample in both if sample is not None]
+
+    def _sample(self, message_id: int, message: Message, arrival_s: float) -> LogSample | None:
         converter = self._converters.get(message_id)
         if converter is not None:
             return converter(message, arrival_s)

@@ -15,9 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.tables import SensorsTable
+from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, normalised
 from agent.sensing.receivers import ReceiverChoice
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, Quaternion, Triple
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    ImuSample,
+    Quaternion,
+    Triple,
+)
 from sim_bridge.replay.logs.events import LogSample, TruthSample
 from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
 from sim_bridge.replay.logs.ulog.tables import TopicTable
@@ -46,6 +55,8 @@ WANTED: dict[str, tuple[str, ...]] = {
     "vehicle_local_position": ("timestamp_sample", *_MOTION, *_REFERENCE, "xy_global", "xy_valid", "z_valid"),
     "vehicle_local_position_groundtruth": ("timestamp_sample", *_MOTION, *_REFERENCE),
     "vehicle_attitude_groundtruth": _QUATERNION,
+    "vehicle_air_data": ("timestamp_sample", "baro_pressure_pa"),
+    "sensor_baro": ("timestamp_sample", "pressure"),
     "timesync_status": ("remote_timestamp", "observed_offset"),
     **dict.fromkeys(GPS_TOPICS, _GPS),
 }
@@ -129,6 +140,25 @@ def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed
             skipped["attitude: no unit quaternion"] += 1
         else:
             yield arrival_s, AttitudeSample(t_s, quaternion)
+
+
+def barometer_table(topics: Mapping[str, TopicTable]) -> TopicTable | None:
+    """The one to be listened to: what the autopilot has chosen of its barometers, or else the first one."""
+    return topics.get("vehicle_air_data") or topics.get("sensor_baro")
+
+
+def baro_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed]:
+    """``vehicle_air_data`` in Pa, or ``sensor_baro``, in hPa before PX4 1.14 and in Pa since."""
+    values = table.stack("baro_pressure_pa" if table.name == "vehicle_air_data" else "pressure")
+    if values is None:
+        skipped[f"{table.name}: fields missing"] += len(table)
+        return
+    for arrival_s, t_s, (pressure,) in _rows(table, values):
+        altitude_m = pressure_altitude_m(pressure)
+        if altitude_m is None:
+            skipped["baro: no pressure of air"] += 1
+        else:
+            yield arrival_s, BaroSample(t_s, altitude_m)
 
 
 def fixes_of(table: TopicTable) -> int:

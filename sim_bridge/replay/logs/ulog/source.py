@@ -31,6 +31,8 @@ from sim_bridge.replay.logs.ulog.samples import (
     WANTED,
     Timed,
     attitude_samples,
+    baro_samples,
+    barometer_table,
     chosen_fixes,
     degrees,
     estimate_samples,
@@ -68,6 +70,8 @@ class UlogSource(SurveyedLog):
             if name == "sensor_combined":
                 biases = tables.topics.get("estimator_sensor_bias")
                 streams.append(imu_samples(table, biases, self._sensors, skipped))
+            elif table is barometer_table(tables.topics):
+                streams.append(baro_samples(table, skipped))
             elif name == "vehicle_attitude":
                 streams.append(attitude_samples(table, skipped))
             elif name == "vehicle_local_position":

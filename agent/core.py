@@ -34,6 +34,7 @@ from agent.fleet.measurements import (
     acceleration_measurement,
     anchor_measurement,
     gps_measurements,
+    ground_measurement,
     height_measurement,
     range_measurement,
 )
@@ -46,8 +47,17 @@ from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tel
 from agent.sensing.barometer import Barometer
 from agent.sensing.climb import without_climb
 from agent.sensing.gps_antenna import at_body
+from agent.sensing.ground import altitude_of
 from agent.sensing.latency import GpsLatency
-from agent.sensing.samples import AttitudeSample, BaroSample, GpsSample, ImuSample, RangeSample, Sample
+from agent.sensing.samples import (
+    AttitudeSample,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    RangeSample,
+    Sample,
+)
 from agent.sensing.timeline import TickInput, Timeline, tick_of
 from agent.watch.health import HealthMonitor
 from agent.watch.integrity_watch import IntegrityWatch
@@ -157,6 +167,8 @@ class AgentCore:
             self.on_gps(sample, now_s)
         elif isinstance(sample, BaroSample):
             self.on_baro(sample, now_s)
+        elif isinstance(sample, GroundSample):
+            self.on_ground(sample, now_s)
 
     def on_imu(self, sample: ImuSample, now_s: float) -> None:
         """An IMU sample."""
@@ -198,6 +210,20 @@ class AgentCore:
             self.counters[f"baro: {height}"] += 1
         else:
             self._count_own("baro", height_measurement(self._agent_id, height, self._period_s))
+
+    def on_ground(self, sample: GroundSample, now_s: float) -> None:
+        """A range finder's sample, which tells a height where it is known what is below."""
+        ground_m = self._config.sensors.ground_m
+        if not self._plausible("ground", sample.t_s, now_s):
+            return
+        if ground_m is None:
+            self.counters["ground: switched off"] += 1
+            return
+        found = altitude_of(sample, self.timeline.orientation_at(sample.t_s), ground_m)
+        if isinstance(found, str):
+            self.counters[f"ground: {found}"] += 1
+        else:
+            self._count_own("ground", ground_measurement(self._agent_id, sample.t_s, *found, self._period_s))
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
         """A range that this agent's module measured."""

@@ -163,6 +163,9 @@ class SensorsTable(Table, frozen=True):
     barometer: bool = True
     """Use the autopilot's barometer, where it sends one and the estimator has `systematic_errors`: it tells how the
     height changes, over minutes. Off where the drone flies in the wind of others, or indoors with doors that open."""
+    ground_m: float | None = None
+    """Altitude above the fleet's origin of the ground, where it is flat and nothing stands on it: a range finder that
+    looks down (DISTANCE_SENSOR) then tells the height; absent = range finders are not used."""
     uwb_sigma_m: Positive = 0.1
     """1-sigma of a range whose driver gives none."""
     uwb_sigma_floor_m: Positive = 0.03

@@ -119,6 +119,14 @@ def height_measurement(observer: int, sample: BaroSample, period_s: float) -> He
     return HeightMeasurement(observer, tick, -sample.altitude_m, SIGMA_M**2, sample.t_s - tick * period_s)
 
 
+def ground_measurement(
+    observer: int, t_s: float, altitude_m: float, sigma_m: float, period_s: float
+) -> GroundHeightMeasurement:
+    """The record of an altitude above the fleet's origin by what was measured to the ground."""
+    tick = nearest_tick(t_s, period_s)
+    return GroundHeightMeasurement(observer, tick, -altitude_m, sigma_m**2, t_s - tick * period_s)
+
+
 def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
     """The record of a tick's averaged acceleration."""
     return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)

@@ -33,6 +33,7 @@ SENSORS = {
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE: "baro",
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE2: "baro",
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE3: "baro",
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: "ground",
 }
 """Messages that show that their sender has sensors, by id: the kind."""
 

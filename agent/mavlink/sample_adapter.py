@@ -20,7 +20,16 @@ from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.latency import Stamp, gps_prior, imu_latency_s
 from agent.sensing.receivers import ReceiverChoice
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample, Sample, Triple
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    Sample,
+    Triple,
+)
 
 MILLI_G_MPS2 = 9.80665e-3
 UNKNOWN_16 = 65535
@@ -53,6 +62,10 @@ _PRESSURES = (
     mavlink.MAVLINK_MSG_ID_SCALED_PRESSURE3,
 )
 """The best one first: of PX4 HIGHRES_IMU comes more often."""
+UNKNOWN_8 = 255
+GROUND_SIGMA_M, GROUND_SHARE = 0.1, 0.02
+"""1-sigma of a range finder that does not tell its own: at least, and of the distance."""
+INVALID_QUALITY = 1
 _ACCEL_AND_GYRO = 0b111111
 _ABSOLUTE_PRESSURE = int(mavlink.HIGHRES_IMU_UPDATED_ABS_PRESSURE)
 MAX_FORCE_MPS2, MAX_TURN_RADPS = 1000.0, 100.0
@@ -231,6 +244,21 @@ class SampleAdapter:
             return None
         t_s = self._stamp(time_usec, arrival_s, "baro", wrap_s)
         return None if t_s is None else BaroSample(t_s, altitude_m)
+
+    def _distance_sensor(self, message: Message, arrival_s: float) -> Sample | None:
+        """DISTANCE_SENSOR in cm, its variance in cm2; of several that look down the one with the lowest number."""
+        if message.orientation != mavlink.MAV_SENSOR_ROTATION_PITCH_270:
+            return self._skip("ground: looks elsewhere")
+        distance_m = message.current_distance * 1e-2
+        within = message.min_distance < message.current_distance < message.max_distance
+        if not within or message.signal_quality == INVALID_QUALITY:
+            return self._skip("ground: out of its reach")
+        if not self._serves("ground", message.id, arrival_s):
+            return None
+        known = message.covariance not in (0, UNKNOWN_8)
+        sigma_m = math.sqrt(message.covariance) * 1e-2 if known else GROUND_SIGMA_M + GROUND_SHARE * distance_m
+        t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "ground", WRAP_MS_S)
+        return None if t_s is None else GroundSample(t_s, distance_m, sigma_m)
 
     # --- GPS -----------------------------------------------------------------------------------------------
 
@@ -420,6 +448,7 @@ _CONVERTERS: dict[int, Callable[[SampleAdapter, Message, float], Sample | None]]
     mavlink.MAVLINK_MSG_ID_RAW_IMU: SampleAdapter._raw_imu,
     **dict.fromkeys(_SCALED_IMUS, SampleAdapter._scaled_imu),
     **dict.fromkeys(_PRESSURES[1:], SampleAdapter._scaled_pressure),
+    mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR: SampleAdapter._distance_sensor,
     mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: SampleAdapter._attitude_quaternion,
     mavlink.MAVLINK_MSG_ID_ATTITUDE: SampleAdapter._attitude,
     mavlink.MAVLINK_MSG_ID_GPS_RAW_INT: SampleAdapter._gps_raw_int,

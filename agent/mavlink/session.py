@@ -44,6 +44,7 @@ LOCAL_POSITION_HZ = 2.0
 FED_POSITION_HZ, FED_STATUS_HZ = 10.0, 5.0
 """The same where the autopilot is given the estimate: what it makes of that is watched."""
 PRESSURE_HZ = 4.0
+GROUND_HZ = 5.0
 ESTIMATOR_STATUS_HZ = 2.0
 """Whether the autopilot's attitude is aided: an attitude without positions is tilted within a second."""
 _ESTIMATOR_STATUS = {
@@ -354,6 +355,8 @@ def _wanted(config: FleetConfig, fed: bool) -> dict[int, float]:
     """Streams and rates in Hz, in the order in which they are asked for; more of an autopilot that is ``fed``."""
     settings = config.mavlink
     more = {mavlink.MAVLINK_MSG_ID_GLOBAL_POSITION_INT: FED_POSITION_HZ} if fed else {}
+    if config.sensors.ground_m is not None:
+        more[mavlink.MAVLINK_MSG_ID_DISTANCE_SENSOR] = GROUND_HZ
     return {
         mavlink.MAVLINK_MSG_ID_HIGHRES_IMU: settings.imu_hz,
         mavlink.MAVLINK_MSG_ID_ATTITUDE_QUATERNION: settings.attitude_hz,

@@ -74,7 +74,7 @@ def _rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-_ON_THE_LINK = ("imu", "attitude", "gps", "baro")
+_ON_THE_LINK = ("imu", "attitude", "gps", "baro", "ground")
 
 
 def counters_of(onboard: OnboardAgent) -> dict[str, int]:

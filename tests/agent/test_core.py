@@ -9,8 +9,9 @@ import pytest
 
 from agent.core import AgentCore
 from agent.outputs import EstimateReady, Tell
-from agent.sensing.samples import ImuSample, RangeSample
+from agent.sensing.samples import AttitudeSample, BaroSample, GroundSample, ImuSample, RangeSample
 from estimators.estimator import Status
+from estimators.model.measurements import Kind
 from tests.support.circling_fleet import CirclingFleet
 from tests.support.notebook_estimator import MakeConfig, Notebook, fix, lone, received, tick_through
 from tests.support.onboard import CONNECTED, onboard_of
@@ -47,6 +48,51 @@ def test_rows_of_a_tick_come_with_it_and_its_input_with_the_next(make_config: Ma
     assert (third[1], third[2]["tick"].tolist(), third[3]["tick"].tolist()) == (1002, [1002] * 4, [1001])
     assert third[2]["offset_s"] == pytest.approx(-0.03)  # it is nearer to the start of the next tick
     assert (fourth[1], len(fourth[2])) == (1003, 0)
+
+
+def heights_counted(core: AgentCore, sensor: str) -> None:
+    """Each sample is counted once: used, or why not."""
+    counted = {name: count for name, count in core.counters.items() if name.startswith(f"{sensor}: ")}
+    assert counted.pop(f"{sensor}: samples") == sum(counted.values())
+
+
+def test_a_barometers_heights_become_rows_where_the_estimator_has_slow_errors(make_config: MakeConfig) -> None:
+    for slow, expected in (("true", 4), ("false", 0)):
+        core, made = lone(make_config, f"estimator.systematic_errors={slow}")
+        tick_through(core, 100.0, 0.5)
+        for k in range(20):
+            core.on_sample(BaroSample(100.5 + 0.1 * k, 440.0 + k), 100.5 + 0.1 * k)
+            tick_through(core, 100.5 + 0.1 * k, 0.1)
+        begun = [call[2] for call in made[0].calls if call[0] == "begin"]
+        heights = np.concatenate([rows[rows["kind"] == Kind.HEIGHT] for rows in begun])
+        assert len(heights) == expected
+        assert (heights["x"] == 1.0).all()
+        if expected:  # from where the estimate had the drone they go up with the barometer
+            assert np.diff(heights["value"]) == pytest.approx(-5.0)
+        heights_counted(core, "baro")
+    core, _ = lone(make_config, "estimator.systematic_errors=true", "sensors.barometer=false")
+    core.advance(100.0, CONNECTED)
+    core.on_sample(BaroSample(100.0, 440.0), 100.0)
+    core.on_sample(BaroSample(10.0, 440.0), 100.0)
+    assert (core.counters["baro: switched off"], core.counters["baro: wrong time"]) == (1, 1)
+    heights_counted(core, "baro")
+
+
+def test_a_range_finders_heights_become_rows_where_the_ground_is_known(make_config: MakeConfig) -> None:
+    for settings, expected in ((("sensors.ground_m=2.0",), 3), ((), 0)):
+        core, made = lone(make_config, *settings)
+        core.advance(100.0, CONNECTED)
+        core.on_sample(GroundSample(100.0, 10.0, 0.1), 100.0)
+        for k in range(3):
+            core.on_sample(AttitudeSample(100.1 + 0.1 * k, (1.0, 0.0, 0.0, 0.0)), 100.1 + 0.1 * k)
+            core.on_sample(GroundSample(100.1 + 0.1 * k, 10.0 + k, 0.2), 100.1 + 0.1 * k)
+        tick_through(core, 100.4, 0.3)
+        begun = [call[2] for call in made[0].calls if call[0] == "begin"]
+        heights = np.concatenate([rows[rows["kind"] == Kind.HEIGHT] for rows in begun])
+        assert heights["value"] == pytest.approx([-12.0, -13.0, -14.0][:expected])
+        assert heights["x"].tolist() == [0.0] * expected
+        assert core.counters["ground: used"] == expected
+        heights_counted(core, "ground")
 
 
 def test_a_fix_that_comes_late_keeps_its_place(make_config: MakeConfig) -> None:

@@ -14,7 +14,7 @@ from agent.config.tables import FleetConfig, SensorsTable
 from agent.mavlink.codec import Decoder, Encoder, mavlink
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.sensing.frames import FleetFrame, rotated
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, GroundSample, ImuSample
 
 FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
 EPOCH_UNIX_S = 1_767_225_600.0
@@ -123,6 +123,39 @@ def test_what_is_no_pressure_of_air_is_no_sample(hpa: float) -> None:
     assert convert(made, pressure(hpa)) is None
     assert made.skipped == {"baro: no pressure of air": 1}
     assert convert(made, pressure(second=True)) is not None  # and a second barometer takes its place
+
+
+def distance(**changed: Any) -> Any:
+    fields: dict[str, Any] = {
+        "time_boot_ms": 99_990, "min_distance": 20, "max_distance": 4000, "current_distance": 1234, "type": 0,
+        "id": 0, "orientation": 25, "covariance": 9,
+    }  # fmt: skip
+    return mavlink.MAVLink_distance_sensor_message(**{**fields, **changed})
+
+
+def test_a_range_finder_is_in_centimetres_and_its_variance_in_their_squares() -> None:
+    made = adapter()
+    sample = convert(made, distance())
+    assert sample == GroundSample(pytest.approx(499.99), pytest.approx(12.34), pytest.approx(0.03))
+    unknown = [convert(made, distance(covariance=value)) for value in (0, 255)]
+    assert [sample.sigma_m for sample in unknown] == pytest.approx([0.3468] * 2)
+    assert convert(made, distance(id=1)) is None
+    assert made.skipped == {"ground: a better one comes": 1}
+
+
+@pytest.mark.parametrize(
+    ("changed", "reason"),
+    [
+        ({"orientation": 0}, "looks elsewhere"),
+        ({"current_distance": 20}, "out of its reach"),
+        ({"current_distance": 4000}, "out of its reach"),
+        ({"signal_quality": 1}, "out of its reach"),
+    ],
+)
+def test_what_sees_no_ground_is_no_sample(changed: dict[str, int], reason: str) -> None:
+    made = adapter()
+    assert convert(made, distance(**changed)) is None
+    assert made.skipped == {f"ground: {reason}": 1}
 
 
 def test_second_imus_and_frames_without_new_data_are_left_out() -> None:

@@ -294,7 +294,8 @@ class OnboardAgent:
         self._note(Served(host_s), host_s)
         frames = self.autopilot.to_send(host_s, SYSTEM_STATUS[self.core.health.health.state])
         if self.feeder is not None:
-            frames += [self.autopilot.encode(each) for each in self.feeder.to_send(self._link(), host_s)]
+            link = self._follow(self.feeder)
+            frames += [self.autopilot.encode(each) for each in self.feeder.to_send(link, host_s)]
         outputs = self._for_autopilot(frames, host_s)
         if self.autopilot.state is not self._told_state:
             self._told_state = self.autopilot.state
@@ -322,8 +323,7 @@ class OnboardAgent:
 
     def _feed(self, ready: EstimateReady, feeder: Feeder, host_s: float) -> list[Output]:
         """What the autopilot is given of an estimate."""
-        session, link = self.autopilot, self._link()
-        feeder.on_life(link, (session.reboots, session.handovers, self._cores))
+        session, link = self.autopilot, self._follow(feeder)
         at_host_s = ready.t_s - self.clock.offset_s
         # PX4 puts stamps on its clock itself, by our answers to its TIMESYNC; ArduPilot takes them as they are
         stamp_s = at_host_s if link.flavour == "px4" else session.clock.boot_s(at_host_s)
@@ -351,6 +351,12 @@ class OnboardAgent:
         if self._journal is not None:
             self._journal.note_sent(frames, self.unix_s(host_s))
         return [ToAutopilot(tuple(frames))]
+
+    def _follow(self, feeder: Feeder) -> FedAutopilot:
+        """Tell the feeder who the autopilot is, and whether anything began anew."""
+        link = self._link()
+        feeder.on_life(link, (self.autopilot.reboots, self.autopilot.handovers, self._cores))
+        return link
 
     def _link(self) -> FedAutopilot:
         autopilot = self.autopilot.autopilot

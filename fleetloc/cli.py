@@ -1,6 +1,6 @@
 """The ``fleetloc`` command: collects the command groups and turns errors into one line and an exit code.
 
-A group of commands is a module ``fleetloc/commands/<name>.py`` with ``register(app)``. All of them are
+A group of commands is a module below ``fleetloc/commands`` with ``register(app)``. All of them are
 imported at every start, so they import what is heavy (numba, scipy, matplotlib, zenoh, the rooms) inside the
 commands.
 """
@@ -51,8 +51,9 @@ def build_app() -> typer.Typer:
         rich_markup_mode=None,
     )
     app.callback(invoke_without_command=True)(_root)
-    for module in pkgutil.iter_modules(commands.__path__):
-        importlib.import_module(f"{commands.__name__}.{module.name}").register(app)
+    for module in pkgutil.walk_packages(commands.__path__, f"{commands.__name__}."):
+        if not module.ispkg:
+            importlib.import_module(module.name).register(app)
     complete(app)
     return app
 

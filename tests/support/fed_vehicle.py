@@ -185,7 +185,17 @@ class FedVehicle:
         mean = np.concatenate((position + noise[:3] + self.off_m(now_s), velocity + noise[3:]))
         state = self.judged(now_s)
         level = ProtectionLevel(3.7 * self.sigma_m, 3.3 * self.sigma_m)
-        statement = Statement(state, "", ErrorEllipse(0.6, 0.6, 0.0, 0.6), level, {}, {}, {}, ())
+        statement = Statement(
+            state=state,
+            reason="",
+            ellipse=ErrorEllipse(0.6, 0.6, 0.0, 0.6),
+            own=level,
+            relative={},
+            guaranteed={},
+            off={},
+            ranges_off=(),
+            undetectable=(),
+        )
         host_s = START_S + t_s
         stamp_s = host_s if self.flavour == "px4" else self.session.clock.boot_s(host_s)
         ready = Ready(

@@ -75,7 +75,17 @@ class Hover:
     def ready(self, t_s: float, state: IntegrityState, lost: bool) -> Ready:
         """An estimate."""
         level = ProtectionLevel(0.5, 0.8)
-        statement = Statement(state, "", ErrorEllipse(0.3, 0.3, 0.0, 0.5), level, {}, {}, {}, ())
+        statement = Statement(
+            state=state,
+            reason="",
+            ellipse=ErrorEllipse(0.3, 0.3, 0.0, 0.5),
+            own=level,
+            relative={},
+            guaranteed={},
+            off={},
+            ranges_off=(),
+            undetectable=(),
+        )
         return Ready(
             t_s,
             self.now_s,

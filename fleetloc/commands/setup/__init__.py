@@ -1,0 +1,1 @@
+"""Commands for setting a drone up."""

@@ -179,6 +179,7 @@ class AgentCore:
         """An attitude."""
         if self._plausible("attitude", sample.t_s, now_s):
             self.timeline.add_attitude(sample)
+            self.integrity.note_frozen(frozen=sample.receiver_frozen)
 
     def on_gps(self, sample: GpsSample, now_s: float) -> None:
         """A fix."""

@@ -306,7 +306,6 @@ class OnboardAgent:
         """What is due in the core; its messages are sealed."""
         self._note(Due(host_s), host_s)
         outputs: list[Output] = []
-        self.core.integrity.note_frozen(frozen=self.autopilot.samples.frozen)
         for output in self.core.advance(self.fleet_s(host_s), str(self.link_state)):
             outputs += self._put_out(output, host_s)
         return outputs

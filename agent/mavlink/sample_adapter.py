@@ -209,7 +209,7 @@ class SampleAdapter:
         if not self._serves("attitude", 0, arrival_s):
             return None
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude", WRAP_MS_S)
-        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
+        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided, self.frozen)
 
     def _attitude(self, message: Message, arrival_s: float) -> Sample | None:
         if not _finite(message.roll, message.pitch, message.yaw):
@@ -218,7 +218,7 @@ class SampleAdapter:
             return None
         t_s = self._stamp(message.time_boot_ms * 1000, arrival_s, "attitude", WRAP_MS_S)
         quaternion = from_euler(message.roll, message.pitch, message.yaw)
-        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided)
+        return None if t_s is None else AttitudeSample(t_s, quaternion, self.aided, self.frozen)
 
     def _estimator_status(self, message: Message, _arrival_s: float) -> Sample | None:
         """ESTIMATOR_STATUS and EKF_STATUS_REPORT have the same flags for what is asked here."""

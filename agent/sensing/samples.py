@@ -29,6 +29,8 @@ class AttitudeSample:
     t_s: float
     quaternion: Quaternion
     aided: bool = True
+    receiver_frozen: bool = False
+    """Whether a receiver repeats a fix that its own velocity contradicts, by then; such fixes give no samples."""
 
 
 @dataclass(frozen=True, slots=True)

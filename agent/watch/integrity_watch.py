@@ -99,6 +99,7 @@ class IntegrityWatch:
             {agent: Guaranteed(each.half_axes(), each.min_range()) for agent, each in sets.items()},
             self._off(estimate.mean[position(own)]),
             tuple(sorted(self._naming.ranges_off)),
+            self._naming.unattributable_nats > 0.0,
             undetectable(self._naming.receivers),
         )
         return self.statement

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 import typer
 
 from fleetloc.bench.fusion_command import fusion
-from fleetloc.bench.integrity.commands import setmembership
+from fleetloc.bench.integrity.commands import integrity, setmembership
 from fleetloc.options import Overrides
 
 if TYPE_CHECKING:
@@ -46,6 +46,7 @@ def register(app: typer.Typer) -> None:
     bench.command("awareness")(awareness)
     bench.command("scale")(scale)
     bench.command("setmembership")(setmembership)
+    bench.command("integrity")(integrity)
     bench.command("real")(real)
     app.add_typer(bench, name="bench")
 

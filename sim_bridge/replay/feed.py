@@ -213,7 +213,7 @@ def _shifted(sample: LogSample, shift_s: float) -> LogSample:
     if isinstance(sample, ImuSample):
         return ImuSample(sample.t_s + shift_s, sample.specific_force_mps2, sample.gyro_radps)
     if isinstance(sample, AttitudeSample):
-        return AttitudeSample(sample.t_s + shift_s, sample.quaternion, sample.aided)
+        return AttitudeSample(sample.t_s + shift_s, sample.quaternion, sample.aided, sample.receiver_frozen)
     if isinstance(sample, BaroSample):
         return BaroSample(sample.t_s + shift_s, sample.altitude_m)
     return replace(sample, t_s=sample.t_s + shift_s)

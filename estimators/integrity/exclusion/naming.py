@@ -16,7 +16,8 @@ import numpy as np
 
 from estimators.integrity.exclusion.baselines import BIN_S, Baselines, Bin, Pair, SharedTick
 from estimators.integrity.exclusion.fault_odds import RANGES_STEP_M, STEP_M, FaultOdds, LikelyFault, Odds
-from estimators.integrity.exclusion.slow_errors import SlowErrors
+from estimators.integrity.exclusion.jumps import JUMPED_SQUARE, jump
+from estimators.integrity.exclusion.slow_errors import Fresh, SlowErrors
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.thresholds import (
     AGREEING_NATS,
@@ -64,6 +65,8 @@ class NamingMonitor:
         self._odds = FaultOdds(AGREEING_NATS)
         self._before: deque[tuple[Bin, Vector, Matrix]] = deque(maxlen=BINS_KEPT)
         """The last bins, and what was known before each."""
+        self._jumped_nats: dict[int, float] = {}
+        """Odds of each receiver having jumped, since what is new is so large."""
         self._last: int | None = None
         """The last bin taken in."""
         self.named: dict[int, Named] = {}
@@ -112,6 +115,7 @@ class NamingMonitor:
             fresh = self._slow.fresh(closed, chosen)
             now = self._odds.take(closed.number, self._slow, fresh, self._slow.take(fresh))
             self.receivers = len({agent for pair in chosen for agent in pair})
+            self._note_jumps(fresh, now)
             self.separation_m = self._separation(now)
             self._judge(now, tick)
         for agent in list(self.named):
@@ -129,12 +133,25 @@ class NamingMonitor:
         usual = max(float(np.quantile([each.scatter for each in closed.pairs.values()] or [1.0], 0.25)), 1.0)
         known = closed.pairs.items()
         found = {pair: each for pair, each in known if each.stuck or each.scatter > SCATTERED * usual}
-        fresh = {pair: each for pair, each in found.items() if pair not in self.ranges_off}
+        fresh = {pair: each for pair, each in found.items() if not self._is_doubted(pair)}
         for pair, each in fresh.items():
             self.ranges_off[pair] = Named(tick, NAMED_NATS, np.array([each.residual_m]))
         if fresh:
             self._begin_again(SCATTERED_S)
             self._odds.restart(self._slow)
+
+    def _note_jumps(self, fresh: Fresh, now: Odds) -> None:
+        """While what is new is so large: the odds of jumps, of all such bins in a row, where they are better."""
+        if fresh.square < JUMPED_SQUARE:
+            self._jumped_nats = {}
+            return
+        for agent in {agent for pair in fresh.pairs for agent in pair}:
+            found = jump(fresh, agent)
+            if found is None:
+                continue
+            nats = self._jumped_nats[agent] = self._jumped_nats.get(agent, 0.0) + found.nats
+            if agent not in now.receivers or now.receivers[agent].nats < nats:
+                now.receivers[agent] = replace(found, nats=nats)
 
     def _pass_by(self, number: int) -> None:
         passed = 1 if self._last is None else number - self._last
@@ -176,6 +193,7 @@ class NamingMonitor:
             shifts = fault.shift_m * ((1.0, -1.0) if len(whose) == 2 else np.ones(len(whose)))
             for pair, shift in zip(whose, shifts, strict=True):
                 self.ranges_off[pair] = Named(tick, fault.nats, np.array([shift]))
+        self._jumped_nats = {}
         self._unlearn(fault)
         if isinstance(whose, int):
             self._slow.forget(self._slow.of_agent(whose))

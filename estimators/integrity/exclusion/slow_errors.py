@@ -36,12 +36,21 @@ class Fresh:
     pairs: tuple[Pair, ...]
     directions: Matrix
     """``(r, 3)``: from the second of a pair to the first."""
+    distances_m: Vector
+    """``(r,)``: between them, by their fixes less what is known of both."""
+    residual_m: Vector
+    """``(r,)``: what is new, not whitened."""
     whiten: Matrix
     """``(r, r)``."""
     value: Vector
     """``(r,)``, whitened."""
     rows: Matrix
     """``(r, N)``: of the states, whitened."""
+
+    @property
+    def square(self) -> float:
+        """Normalised square, on average: 1 while nobody is off."""
+        return float(self.value @ self.value) / len(self.value)
 
     def sign(self, agent: int) -> Vector:
         """``(r,)``: of a drone's error in what is left over, along the direction."""
@@ -91,15 +100,15 @@ class SlowErrors:
     def fresh(self, made: Bin, chosen: Sequence[Pair]) -> Fresh:
         """What is new in the chosen pairs of a bin (at least one), linearised at what is known of their drones."""
         left = [made.pairs[pair] for pair in chosen]
-        residual, directions = self._left(chosen, left)
+        residual, directions, distances = self._left(chosen, left)
         rows = self._rows(chosen, directions)
         noise = _noise(made, chosen, left, directions)
         whiten = np.linalg.inv(np.linalg.cholesky(rows @ self.covariance @ rows.T + noise))
-        return Fresh(tuple(chosen), directions, whiten, whiten @ residual, whiten @ rows)
+        return Fresh(tuple(chosen), directions, distances, residual, whiten, whiten @ residual, whiten @ rows)
 
     def take(self, fresh: Fresh) -> Matrix:
         """Learn from what is new; gives the gain ``(N, r)`` of the whitened values, 0 where it is too much to be."""
-        if fresh.value @ fresh.value > ABSURD_SQUARE * len(fresh.value):
+        if fresh.square > ABSURD_SQUARE:
             return np.zeros_like(fresh.rows.T)
         gain = self.covariance @ fresh.rows.T
         self.state = self.state + gain @ fresh.value
@@ -130,16 +139,16 @@ class SlowErrors:
         """The state of a pair."""
         return 3 * len(self.agents) + self.pairs.index(pair)
 
-    def _left(self, chosen: Sequence[Pair], left: Sequence[LeftOver]) -> tuple[Vector, Matrix]:
-        """What is left over of ranges, and the directions between the drones, less what is known of both."""
-        residual, directions = np.zeros(len(chosen)), np.zeros((len(chosen), 3))
+    def _left(self, chosen: Sequence[Pair], left: Sequence[LeftOver]) -> tuple[Vector, Matrix, Vector]:
+        """What is left over of ranges, directions and distances between the drones, less what is known of both."""
+        residual, directions, distances = np.zeros(len(chosen)), np.zeros((len(chosen), 3)), np.zeros(len(chosen))
         for at, (pair, each) in enumerate(zip(chosen, left, strict=True)):
             one, other = (self.state[self.of_agent(agent)] for agent in pair)
             apart = each.distance_m * each.direction - one + other
-            distance = float(np.linalg.norm(apart))
+            distance = distances[at] = float(np.linalg.norm(apart))
             directions[at] = apart / distance if distance > NEAREST_M else each.direction
             residual[at] = each.residual_m + each.distance_m - distance - self.state[self.of_pair(pair)]
-        return residual, directions
+        return residual, directions, distances
 
     def _rows(self, chosen: Sequence[Pair], directions: Matrix) -> Matrix:
         rows = np.zeros((len(chosen), len(self.state)))

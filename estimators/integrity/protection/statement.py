@@ -65,6 +65,8 @@ class Statement:
     """Whose fixes are off, by id, and by how many metres."""
     ranges_off: tuple[tuple[int, int], ...]
     """Between whom ranges are off, by id."""
+    unattributable: bool
+    """Whether somebody's fixes are off now, and it cannot be told whose."""
     undetectable: tuple[str, ...]
     """What could be wrong and would not be seen, always."""
 

@@ -1,1 +1,2 @@
-"""Studies of what can be trusted: guaranteed sets (`set_membership`), and their commands (`commands`)."""
+"""Studies of what can be trusted, and their `commands`: guaranteed sets (`set_membership`), promises under faults
+(`study`, its `flights`, and `stanford` diagrams)."""

@@ -21,7 +21,8 @@ POSITION_SIGMA_M = 50.0
 VELOCITY_SIGMA_MPS = 3.0
 """Per axis about the velocity that the first fixes show, or about zero."""
 SPEED_SIGMA_MPS = 0.15
-"""A velocity surer than this needs no more fixes, up to `ENOUGH_FIXES`: a speed is linearised about its direction."""
+"""A velocity surer than this needs no more fixes, up to `ENOUGH_FIXES`: a speed is linearised about its direction.
+Nor does one that is measured itself: it is linear."""
 VELOCITY_SPREAD = 2.0
 """On the variance of a velocity that is the slope of fixes: their errors are not quite independent."""
 
@@ -65,12 +66,15 @@ class FixTracks:
         variance = np.array([fix.variance_m2 for fix in fixes])
         variance += wandered[[at_tick - fix.tick for fix in fixes]][:, None]
         position, velocity, speed_variance = self._line(lead_s, places, variance)
-        if self._count[agent_id] < ENOUGH_FIXES and speed_variance.max() > SPEED_SIGMA_MPS**2:
+        measured = self._velocities.get(agent_id)
+        if measured is not None and abs(at_tick - measured.tick) > FIX_MEMORY_TICKS:
+            measured = None
+        few = self._count[agent_id] < ENOUGH_FIXES
+        if few and measured is None and speed_variance.max() > SPEED_SIGMA_MPS**2:
             return None
         mean, covariance = self.prior(position, velocity)
         covariance[3:, 3:] = np.diag(speed_variance)
-        measured = self._velocities.get(agent_id)
-        if measured is not None and abs(at_tick - measured.tick) <= FIX_MEMORY_TICKS:
+        if measured is not None:
             known = np.asarray(measured.variance_m2ps2) < speed_variance
             mean[3:][known] = np.asarray(measured.velocity_mps)[known]
             covariance[3:, 3:][np.diag(known)] = VELOCITY_SIGMA_MPS**2  # measured again in the window

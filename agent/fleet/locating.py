@@ -20,6 +20,7 @@ from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
 from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
+from estimators.model.layout import BodyKind
 from estimators.model.limits import target_limits
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.multilateration import Place, RangeSet, multilaterate
@@ -38,6 +39,10 @@ CORRELATED = 4.0
 
 TARGET_SIGMA_M = 15.0
 """A target less well known is not one of the state yet."""
+WIDENED = 9.0
+"""On the covariance of a target's place by ranges that the window holds as well."""
+STANDING_MPS = 0.02
+"""1-sigma per axis of the velocity of a target that is said to be fixed."""
 TARGET_BIAS_M = 0.5
 """1-sigma of the bias of ranges to it, which all share."""
 
@@ -57,7 +62,7 @@ class RangeLocator:
         self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
         self._monitor, self._target_monitor = RangeLocationMonitor(), RangeLocationMonitor(TARGET_SIGMA_M)
-        self._targets = frozenset(config.kinds)
+        self._kinds = config.kinds
         self._target_limits = target_limits(config.estimator)
         self.findings: dict[int, tuple[Finding, ...]] = {}
         """Why a drone's ranges did not locate it, as of the last attempt."""
@@ -81,32 +86,45 @@ class RangeLocator:
 
     def place(self, agent_id: int, at_tick: int) -> Prior | None:
         """The prior of a drone at a tick from its ranges before that tick; ``None`` if they leave it open."""
-        found = self._fit(agent_id, at_tick)
+        return self._taken(agent_id, self._fit(agent_id, at_tick, at_tick), self._monitor, CORRELATED)
+
+    def place_target(self, target_id: int, at_tick: int, until_tick: int) -> Prior | None:
+        """The prior of a target at a tick from its ranges before a later one; ``None`` if they leave it open.
+
+        The window holds the ranges after ``at_tick`` too. So the prior is so wide that they hardly count twice: it
+        says where to begin, and the window says the rest.
+        """
+        return self._taken(target_id, self._fit(target_id, at_tick, until_tick), self._target_monitor, WIDENED)
+
+    def _taken(
+        self, agent_id: int, found: Place | None, monitor: RangeLocationMonitor, inflation: float
+    ) -> Prior | None:
         self.findings[agent_id] = ()
         if found is None:
             return None
-        monitor = self._target_monitor if agent_id in self._targets else self._monitor
         self.findings[agent_id] = monitor.observe(RangeLocation(found.fits, len(found.rivals), found.sigma_m))
-        return None if self.findings[agent_id] else (found.mean, CORRELATED * found.covariance)
+        return None if self.findings[agent_id] else (found.mean, inflation * found.covariance)
 
-    def _fit(self, agent_id: int, at_tick: int) -> Place | None:
+    def _fit(self, agent_id: int, at_tick: int, until_tick: int) -> Place | None:
+        """At ``at_tick``, by the ranges before ``until_tick``."""
         usable = [
             (record, other, place)
             for record in self._ranges
-            if record.tick < at_tick
+            if record.tick < until_tick
             and (other := _other_end(record, agent_id)) is not None
             and (place := self._place_of(record, other)) is not None
         ]
         usable.sort(key=lambda each: each[0].tick)
         usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
-        if len(usable) < MIN_RANGES or at_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
+        if len(usable) < MIN_RANGES or until_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
             return None
         moved, wandered = self._motions.before(agent_id, at_tick)
         count: Counter[int | Triple] = Counter()
         for _, other, _ in usable:
             count[other] += 1
         anchors, leads, shifts, values, variances = [], [], [], [], []
-        is_target = agent_id in self._targets
+        kind = self._kinds.get(agent_id)
+        is_target = kind is not None
         biased = TARGET_BIAS_M**2 if is_target else 0.0
         for record, other, (mean, covariance) in usable:
             back = at_tick - record.tick
@@ -114,13 +132,14 @@ class RangeLocator:
             side = 1.0 if record.observer == other else -1.0
             anchors.append(mean[:3] + record.offset_s * mean[3:] + side * np.array(shift.arm_m))
             leads.append(record.offset_s - back * self._period_s)
-            shifts.append(moved[back])
+            shifts.append(moved[abs(back)])  # of a target, which alone has ranges after the tick, nothing is told
             values.append(record.range_m)
             # an error that all ranges to a drone share does not average out over their number
             shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
-            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[back] + biased)
+            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[abs(back)] + biased)
         ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
-        return multilaterate(ranges, VELOCITY_SIGMA_MPS, self._target_limits if is_target else None)
+        speed_mps = STANDING_MPS if kind is BodyKind.ANCHOR else VELOCITY_SIGMA_MPS
+        return multilaterate(ranges, speed_mps, self._target_limits if is_target else None)
 
     def _place_of(self, record: RangeMeasurement | AnchorRangeMeasurement, other: int | Triple) -> _Place | None:
         """The other end of a range at its tick, if that is known."""

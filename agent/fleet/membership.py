@@ -38,7 +38,7 @@ from transport.messages.measurement_body import (
 )
 from transport.messages.window_body import WindowStates
 
-ATTEMPT_EVERY_TICKS = 3
+ATTEMPT_EVERY_S = 0.3
 """Places by ranges are sought this often: an attempt takes some milliseconds."""
 INFORMED_SHARE = 0.25
 """A position this much surer than silence would have left it has been spoken of on the way."""
@@ -79,6 +79,7 @@ class Membership:
         self._sigma_m: dict[int, float] = {}
         self._places: dict[int, Vector] = {}
         self._targets = frozenset(config.kinds)
+        self._attempt_ticks = max(round(ATTEMPT_EVERY_S / config.fleet.period_s), 1)
         self.members: tuple[int, ...] = ()
         self.own_located = False
         self.wanted: frozenset[int] | None = None
@@ -242,8 +243,10 @@ class Membership:
     def _place(self, agent: int, tick: int, at_tick: int) -> Prior | None:
         heard = tick - self._heard.get(agent, -math.inf) <= RANGED_TICKS
         place = self._tracks.place(agent, at_tick) if heard else None
-        if place is None and tick % ATTEMPT_EVERY_TICKS == 0:
-            place = self._locator.place(agent, at_tick)
+        if place is None and tick % self._attempt_ticks == 0:
+            is_target = agent in self._targets
+            locate = self._locator
+            place = locate.place_target(agent, at_tick, tick) if is_target else locate.place(agent, at_tick)
         if place is None and agent in self._told:
             told_tick, (mean, covariance) = self._told[agent]
             moved = mean[:3] + (at_tick - told_tick) * self._period_s * mean[3:]

@@ -1,0 +1,98 @@
+"""A target's first place: from ranges that the window holds too, and so wide that they hardly count twice."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+
+from agent.config.reading import config_from
+from agent.config.tables import FleetConfig
+from agent.fleet.fix_tracks import FixTracks
+from agent.fleet.locating import RangeLocator
+from agent.fleet.motions import Motions
+from transport.messages.measurement_body import PositionMeasurement, RangeMeasurement, VelocityMeasurement
+
+TARGET = 101
+DRONES_M = np.array([[0, 0, -40], [60, 0, -45], [0, 60, -55], [60, 60, -70], [30, 90, -50]], float)
+PERIOD_S = 1.0
+
+
+def config(motion: str) -> FleetConfig:
+    return config_from(
+        {
+            "fleet": {"name": "t", "period_s": PERIOD_S, "origin": {"lat_deg": 47.0, "lon_deg": 8.0, "alt_m": 0.0}},
+            "agents": [{"id": i, "mavlink": f"udpin:127.0.0.1:{24580 + i}"} for i in range(1, 6)],
+            "targets": [{"id": TARGET, "motion": motion}],
+            "estimator": {"limits": {"target": {"ceiling_m": 5.0}}},
+            "security": {"mode": "unsigned"},
+        },
+        "test",
+    )
+
+
+def located(motion: str, velocity_mps: tuple[float, float, float], ticks: int, begin: int = 0) -> RangeLocator:
+    """A locator that knows the drones from tick ``begin`` on, and has the ranges of ``ticks`` ticks."""
+    fleet = config(motion)
+    locator = RangeLocator(fleet, Motions(fleet))
+    for tick in range(ticks):
+        if tick >= begin:
+            places = {
+                i: (np.array((*DRONES_M[i - 1], 0.0, 0.0, 0.0)), 0.01 * np.eye(3)) for i in range(1, 6)
+            }
+            locator.note_places(tick, places)
+        place = np.array((20.0, 30.0, 0.0)) + tick * PERIOD_S * np.array(velocity_mps)
+        for i in range(1, 6):
+            locator.note(RangeMeasurement(i, tick, TARGET, float(np.linalg.norm(place - DRONES_M[i - 1])), 0.25))
+    return locator
+
+
+@pytest.mark.parametrize(("motion", "velocity_mps"), [("fixed", (0.0, 0.0, 0.0)), ("moving", (2.0, -1.0, 0.0))])
+def test_it_is_located_at_the_windows_begin_by_ranges_after_that(
+    motion: str, velocity_mps: tuple[float, float, float]
+) -> None:
+    # GIVEN drones that are known from tick 4 on, where the window begins WHEN four more ticks have passed
+    found = located(motion, velocity_mps, ticks=8, begin=4).place_target(TARGET, at_tick=4, until_tick=8)
+    # THEN the target has a place at the window's begin, and its covariance holds the error
+    assert found is not None
+    mean, covariance = found
+    error = mean[:3] - (np.array((20.0, 30.0, 0.0)) + 4 * PERIOD_S * np.array(velocity_mps))
+    assert np.linalg.norm(error) < 1.0
+    assert error @ np.linalg.solve(covariance[:3, :3], error) < 16.0
+
+
+def test_the_prior_holds_a_ninth_of_what_the_ranges_say() -> None:
+    # GIVEN ranges, and the information in them about a target that stands
+    found = located("fixed", (0.0, 0.0, 0.0), ticks=6).place_target(TARGET, at_tick=0, until_tick=6)
+    assert found is not None
+    away = np.array((20.0, 30.0, 0.0)) - DRONES_M
+    rows = away / np.linalg.norm(away, axis=1)[:, None]
+    information = 6 * rows.T @ rows / 0.25  # at least this much: the variances that it assumes are larger
+    prior = np.linalg.inv(found[1][:3, :3])
+    assert np.linalg.eigvalsh(information / 9.0 - prior).min() > 0.0
+
+
+def test_without_enough_ranges_there_is_none() -> None:
+    assert located("fixed", (0.0, 0.0, 0.0), ticks=8, begin=8).place_target(TARGET, at_tick=4, until_tick=8) is None
+
+
+
+def fixes(tracks: FixTracks, count: int, velocity: bool) -> None:
+    for tick in range(count):
+        tracks.note(PositionMeasurement(1, tick, (2.0 * tick, 0.0, -30.0), (1.0, 1.0, 1.0)))
+        if velocity:
+            tracks.note(VelocityMeasurement(1, tick, (2.0, 0.0, 0.0), (0.01, 0.01, math.inf)))
+
+
+def test_a_drone_whose_velocity_is_measured_starts_with_its_first_fixes() -> None:
+    # GIVEN fixes of a metre, a second apart: their slope says little of the velocity for long
+    fleet = config("fixed")
+    slow, quick = (FixTracks(fleet, Motions(fleet)) for _ in range(2))
+    fixes(slow, 6, velocity=False)
+    fixes(quick, 6, velocity=True)
+    # THEN who measures its velocity need not wait for it
+    assert slow.place(1, 6) is None
+    found = quick.place(1, 6)
+    assert found is not None
+    np.testing.assert_allclose(found[0][3:5], (2.0, 0.0))

@@ -47,6 +47,8 @@ IMU_SPACING_S = 0.04
 EDGE_S = 1e-6
 GRAVITY_MPS2 = 9.80665
 LINGER_TICKS = 2.0
+KEPT_S = 60.0
+"""Drones beyond a link that fails are kept in mind for longer than any outage."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,7 @@ def config_of(measured: AwarenessInput, settings: EstimatorSettings) -> FleetCon
             "period_s": PERIOD_S,
             "origin": {"lat_deg": 0.0, "lon_deg": 0.0, "alt_m": 0.0},
             "edges": [list(edge) for edge in EDGES[measured.scenario.graph]],
+            "absent_after_s": KEPT_S,
         },
         "agents": [{"id": each, "mavlink": f"udpin:127.0.0.1:{14550 + each}"} for each in range(1, DRONES + 1)],
         "estimator": {k: v for k, v in msgspec.to_builtins(settings).items() if v is not None},

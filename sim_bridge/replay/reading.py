@@ -33,7 +33,7 @@ STREAMED = ("tlog", "dataflash")
 
 _FREQUENT: tuple[tuple[type[Any], Callable[[Any], tuple[Any, ...]]], ...] = (
     (ImuSample, lambda s: (s.t_s, s.specific_force_mps2, s.gyro_radps)),
-    (AttitudeSample, lambda s: (s.t_s, s.quaternion, s.aided)),
+    (AttitudeSample, lambda s: (s.t_s, s.quaternion, s.aided, s.receiver_frozen)),
     (RangeLine, lambda r: (r.time_s, r.observer, r.target, r.range_m, r.sigma_m, r.true_m)),
     (type(None), lambda _: ()),
 )

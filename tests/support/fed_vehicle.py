@@ -23,8 +23,8 @@ from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AttitudeSample, GpsSample
 from estimators.estimator import Status
 from estimators.factory import make_estimator
-from estimators.integrity.protection.levels import ErrorEllipse, ProtectionLevel
-from estimators.integrity.protection.statement import IntegrityState, Statement
+from estimators.integrity.protection.levels import ProtectionLevel
+from estimators.integrity.protection.statement import IntegrityState
 from estimators.model.measurements import Vector
 from sim_bridge.autopilot.fake_autopilot import FakeAutopilot
 from sim_bridge.autopilot.flavours import FlightMode
@@ -32,6 +32,7 @@ from sim_bridge.world.guidance import Waypoints
 from sim_bridge.world.noise import FlavourName
 from sim_bridge.world.scenario import Interval, Scenario, Vehicle
 from sim_bridge.world.simulation import Simulation
+from tests.support.statements import statement
 from transport.security.auth import Identity
 
 START_S, EPOCH_UNIX_S = 1000.0, 1_767_225_600.0
@@ -185,17 +186,6 @@ class FedVehicle:
         mean = np.concatenate((position + noise[:3] + self.off_m(now_s), velocity + noise[3:]))
         state = self.judged(now_s)
         level = ProtectionLevel(3.7 * self.sigma_m, 3.3 * self.sigma_m)
-        statement = Statement(
-            state=state,
-            reason="",
-            ellipse=ErrorEllipse(0.6, 0.6, 0.0, 0.6),
-            own=level,
-            relative={},
-            guaranteed={},
-            off={},
-            ranges_off=(),
-            undetectable=(),
-        )
         host_s = START_S + t_s
         stamp_s = host_s if self.flavour == "px4" else self.session.clock.boot_s(host_s)
         ready = Ready(
@@ -205,7 +195,7 @@ class FedVehicle:
             mean,
             np.eye(6) * self.sigma_m**2,
             Status.OK,
-            statement,
+            statement(state, level, 0.6),
             self._quaternion,
             None if stamp_s is None or stamp_s < 0 else round(stamp_s * 1e6),
             now_s - self._fix_s > LOST_AFTER_S,

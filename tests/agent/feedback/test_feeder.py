@@ -17,9 +17,10 @@ from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AutopilotEstimate, GpsSample
 from estimators.estimator import Status
 from estimators.integrity.finding import What
-from estimators.integrity.protection.levels import ErrorEllipse, ProtectionLevel
-from estimators.integrity.protection.statement import IntegrityState, Statement
+from estimators.integrity.protection.levels import ProtectionLevel
+from estimators.integrity.protection.statement import IntegrityState
 from tests.support.onboard import onboard_of
+from tests.support.statements import statement
 
 FRAME = FleetFrame(47.0, 8.0, 400.0, msl=True)
 ORIGIN_M = (30.0, -20.0, 2.0)
@@ -74,18 +75,6 @@ class Hover:
 
     def ready(self, t_s: float, state: IntegrityState, lost: bool) -> Ready:
         """An estimate."""
-        level = ProtectionLevel(0.5, 0.8)
-        statement = Statement(
-            state=state,
-            reason="",
-            ellipse=ErrorEllipse(0.3, 0.3, 0.0, 0.5),
-            own=level,
-            relative={},
-            guaranteed={},
-            off={},
-            ranges_off=(),
-            undetectable=(),
-        )
         return Ready(
             t_s,
             self.now_s,
@@ -93,7 +82,7 @@ class Hover:
             np.array((*AT_M, 0.0, 0.0, 0.0)),
             np.eye(6) * 0.04,
             Status.OK,
-            statement,
+            statement(state, ProtectionLevel(0.5, 0.8), 0.3),
             (1.0, 0.0, 0.0, 0.0),
             round(t_s * 1e6) if t_s > 0 else None,
             lost,

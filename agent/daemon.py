@@ -441,7 +441,7 @@ class Daemon:
         counters["packets unsent"] += radio.pop("packets unsent")
         counters |= radio | {"program faults": self._faults.count}
         counters["diagnostics left out"] = self._left_out
-        if self._earlier is not None:
+        if self._earlier is not None and self._earlier.refused:
             counters["rejected seen before the start"] = self._earlier.refused
         if self._record is not None:
             counters |= self._record.counters()

@@ -1,6 +1,7 @@
 """The entry of the command, as ``fleetloc`` and as ``python -m fleetloc``.
 
-Looks whose packages would be imported before it imports any: see `fleetloc.shadowing`.
+Looks whose packages would be imported before it imports any: see `fleetloc.shadowing`. Then it sees to it that the
+linear algebra of this process has one thread.
 """
 
 from __future__ import annotations
@@ -19,6 +20,10 @@ def main() -> int:
     if complaint is not None:
         print(f"fleetloc: error: {complaint}", file=sys.stderr)  # noqa: T201
         return REFUSED
+    # before numpy is there: the threads of many daemons wait for each other in busy loops
+    from fleetloc.bench.speed.environment import use_one_thread
+
+    use_one_thread(unless_set=True)
     from fleetloc import cli  # only now
 
     return cli.main()

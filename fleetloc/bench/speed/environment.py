@@ -18,13 +18,15 @@ THREAD_VARIABLES = (
 PACKAGES = ("numpy", "scipy", "numba", "osqp", "daqp", "casadi", "gtsam")
 
 
-def use_one_thread() -> None:
+def use_one_thread(*, unless_set: bool = False) -> None:
     """One thread for every BLAS of this process; it has to happen before numpy is imported.
 
-    Small matrices lose by threads, and a daemon shares its processor with the autopilot's companions.
+    Small matrices lose by threads, and a daemon shares its processor with the autopilot's companions. ``unless_set``:
+    what the user has set stays.
     """
     for variable in THREAD_VARIABLES:
-        os.environ[variable] = "1"
+        if not (unless_set and variable in os.environ):
+            os.environ[variable] = "1"
 
 
 def describe() -> dict[str, Any]:

@@ -134,7 +134,7 @@ class AgentCore:
         self._input: TickInput | None = None
         self._last_fix_s: float | None = None
         self._altitude_m: float | None = None
-        """Own altitude above the fleet's origin, likewise."""
+        """Own altitude above the fleet's origin by the last estimate."""
         self._climb_mps: float | None = None
         """Own rate of climb or descent by the last estimate."""
         self._fix_interval_s: float | None = None

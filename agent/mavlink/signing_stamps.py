@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from pathlib import Path
 
@@ -10,14 +9,12 @@ import msgspec
 
 from agent.errors import LogFileError
 from agent.mavlink.signing import LinkSigning, Stamps
-from agent.watch.observers import DaemonState, Observer
+from agent.watch.saving import Saver
 from transport.errors import KeyFileError
 from transport.link.off_loop import off_loop
 from transport.security.key_files import OTHERS, PRIVATE, check_mode, read_text, write_text
 
 LOG = logging.getLogger("fleetloc.agent")
-SAVE_EVERY_S = 10
-"""A daemon that is killed forgets at most this much: its last frames could be replayed once."""
 
 
 class StampFile:
@@ -44,28 +41,16 @@ class StampFile:
             raise LogFileError(str(error)) from None
 
 
-class StampKeeper(Observer):
-    """Saves the stamps of a link every ten seconds and at the end, off the daemon's loop."""
+class StampKeeper(Saver):
+    """Saves the stamps of a link; what came since, before a daemon was killed, could be replayed once."""
 
     def __init__(self, signing: LinkSigning, file: StampFile) -> None:
+        super().__init__()
         self._signing, self._file = signing, file
-        self._seconds = 0
-        self._saving: asyncio.Task[None] | None = None
 
-    def on_second(self, state: DaemonState) -> None:
-        """Save every tenth time."""
-        self._seconds += 1
-        if self._seconds % SAVE_EVERY_S == 0 and (self._saving is None or self._saving.done()):
-            self._saving = asyncio.get_running_loop().create_task(self._save())
-
-    async def close(self, state: DaemonState) -> None:
-        """Save for the next start."""
-        if self._saving is not None:
-            await self._saving
-        await self._save()
-
-    async def _save(self) -> None:
+    async def save(self) -> None:
+        """Write them; a disk that does not take them ends no flight."""
         try:
             await off_loop(self._file.save, self._signing.stamps)
-        except LogFileError as error:  # a full disk does not end a flight
+        except LogFileError as error:
             LOG.warning("mavlink signing: %s", error)

@@ -6,14 +6,13 @@ recording does not know what was before it.
 
 from __future__ import annotations
 
-import asyncio
 import logging
 from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
 
-from agent.watch.observers import DaemonState, Observer
+from agent.watch.saving import Saver
 from transport.errors import KeyFileError, Reason, Rejected
 from transport.link.off_loop import off_loop
 from transport.messages.header import PacketKind, fleet_hash, unpack_header
@@ -21,8 +20,6 @@ from transport.security.key_files import OTHERS, PRIVATE, check_mode, read_text,
 from transport.security.replay_guard import ReplayGuard, Seen, StreamOf
 
 LOG = logging.getLogger("fleetloc.agent")
-SAVE_EVERY_S = 10
-"""A daemon that is killed forgets at most this much."""
 
 
 class _SeenRecord(msgspec.Struct, frozen=True):
@@ -34,16 +31,15 @@ class _SeenRecord(msgspec.Struct, frozen=True):
     """Hexadecimal: 64 bits are more than JSON's numbers are good for."""
 
 
-class EarlierPackets(Observer):
+class EarlierPackets(Saver):
     """Keeps in ``path`` what ``state`` says was seen, and knows what was kept there before."""
 
     def __init__(self, path: Path, fleet: str, state: Callable[[], dict[StreamOf, Seen]]) -> None:
         """Read the file; one that is damaged is said and begun anew. Raises `KeyFileError` if others may write it."""
+        super().__init__()
         self._path, self._fleet, self._state = path, fleet_hash(fleet), state
         self._before = _read(path)
         self._guard = ReplayGuard(self._before)
-        self._seconds = 0
-        self._saving: asyncio.Task[None] | None = None
         self.refused = 0
         """Packets that were seen before the start."""
 
@@ -57,26 +53,15 @@ class EarlierPackets(Observer):
             return seen
         return False
 
-    def on_second(self, state: DaemonState) -> None:
-        """Save every tenth time."""
-        self._seconds += 1
-        if self._seconds % SAVE_EVERY_S == 0 and (self._saving is None or self._saving.done()):
-            self._saving = asyncio.get_running_loop().create_task(self._save())
-
-    async def close(self, state: DaemonState) -> None:
-        """Save for the next start."""
-        if self._saving is not None:
-            await self._saving
-        await self._save()
-
-    async def _save(self) -> None:
+    async def save(self) -> None:
+        """Write the file anew; a disk that does not take it ends no flight."""
         kept = [
             _SeenRecord(sender, int(kind), seen.boot, seen.newest, f"{seen.window:x}")
             for (sender, kind), seen in (self._before | self._state()).items()
         ]
         try:
             await off_loop(write_text, self._path, msgspec.json.encode(kept).decode("ascii"), PRIVATE)
-        except KeyFileError as error:  # a full disk does not end a flight
+        except KeyFileError as error:
             LOG.warning("packets seen: %s", error)
 
 

@@ -10,7 +10,6 @@ import signal
 import socket
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +25,7 @@ from agent.outputs import ClockStepped
 from agent.watch.observers import DaemonState, Observer
 from estimators.estimator import Status
 from estimators.factory import make_estimator
+from tests.support.awaiting import until
 from tests.support.ports import HOST
 from transport.link.session import Handlers, open_session
 from transport.link.session_settings import SessionSettings
@@ -60,17 +60,6 @@ class UdpAutopilot(asyncio.DatagramProtocol):
                 await asyncio.sleep(0.005)  # the autopilot's own pace, not a wait of the test
         finally:
             transport.close()
-
-
-async def until(condition: Callable[[], bool], what: str) -> None:
-    async def poll() -> None:
-        while not condition():
-            await asyncio.sleep(0.01)
-
-    try:
-        await asyncio.wait_for(poll(), PATIENCE_S)
-    except TimeoutError:
-        pytest.fail(f"in {PATIENCE_S:g} s not seen: {what}")
 
 
 async def test_two_daemons_find_their_autopilots_and_each_other(

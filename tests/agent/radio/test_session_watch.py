@@ -15,6 +15,7 @@ import pytest
 from agent.radio import radio as radio_module
 from agent.radio.radio import Listener, Radio
 from agent.radio.session_watch import LONGEST_PAUSE_HEARING_S, LONGEST_PAUSE_S, SILENT_S, SessionWatch
+from tests.support.awaiting import until
 from transport.link import session as session_module
 from transport.link.session import Handlers, Session, open_session
 from transport.link.session_settings import SessionSettings
@@ -56,17 +57,6 @@ def test_after_all_have_been_heard_it_begins_anew() -> None:
     assert due(watch, lambda _: {2: 0.0}, 50.0)
     assert not watch.is_due(51.0, {2: 51.0})
     assert [t for t in (52.0, 55.9, 56.0, 57.0, 61.0) if watch.is_due(t, {2: 51.0})] == [56.0, 61.0]
-
-
-async def until(condition: Callable[[], bool], what: str) -> None:
-    async def poll() -> None:
-        while not condition():
-            await asyncio.sleep(0.01)
-
-    try:
-        await asyncio.wait_for(poll(), PATIENCE_S)
-    except TimeoutError:
-        pytest.fail(f"in {PATIENCE_S:g} s not seen: {what}")
 
 
 async def test_a_radio_whose_neighbour_fell_silent_is_opened_anew_and_heard_again(

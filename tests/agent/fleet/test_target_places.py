@@ -71,6 +71,7 @@ def test_the_prior_holds_a_ninth_of_what_the_ranges_say() -> None:
     information = 6 * rows.T @ rows / 0.25  # at least this much: the variances that it assumes are larger
     prior = np.linalg.inv(found[1][:3, :3])
     assert np.linalg.eigvalsh(information / 9.0 - prior).min() > 0.0
+    assert np.linalg.eigvalsh(prior - information / 90.0).min() > 0.0  # and it is no empty one
 
 
 def test_without_enough_ranges_there_is_none() -> None:

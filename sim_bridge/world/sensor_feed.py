@@ -10,9 +10,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Any
 
-from agent.sensing.samples import AttitudeSample, ImuSample
+from agent.mavlink.session import PRESSURE_HZ
+from agent.sensing.barometer import pressure_altitude_m
+from agent.sensing.samples import AttitudeSample, BaroSample, ImuSample
 from sim_bridge.autopilot.mavlink_wire import gps_raw_int
-from sim_bridge.world.sensors import SensedRanges, quaternion_of, vector_of
+from sim_bridge.world.sensors import SensedImu, SensedRanges, quaternion_of, vector_of
 from sim_bridge.world.simulation import Simulation
 from sim_bridge.world.truth import Truth, TruthRecorder
 from sim_bridge.world.unaided import AIDED_S, UnaidedTilt
@@ -27,7 +29,7 @@ class Sensed:
     A fix stays a message since the agent makes its variances of what the receiver says.
     """
 
-    samples: list[tuple[int, ImuSample | AttitudeSample]] = field(default_factory=list)
+    samples: list[tuple[int, ImuSample | AttitudeSample | BaroSample]] = field(default_factory=list)
     fixes: list[tuple[int, Any]] = field(default_factory=list)
     ranges: list[SensedRanges] = field(default_factory=list)
 
@@ -58,6 +60,7 @@ class SensorFeed:
         scenario, step_s = simulation.scenario, simulation.world.step_s
         self._imu = _StepGrid(min(imu_hz, scenario.imu_hz), step_s)
         self._attitude = _StepGrid(min(attitude_hz, scenario.attitude_hz), step_s)
+        self._pressure = _StepGrid(PRESSURE_HZ, step_s)
         self._attitude_period_s = 1.0 / min(attitude_hz, scenario.attitude_hz)
         self._tilts = [UnaidedTilt() for _ in scenario.ids]
         self._aided_until_s: list[float | None] = [None for _ in scenario.ids]
@@ -76,6 +79,7 @@ class SensorFeed:
         sensed = Sensed(ranges=sensors.ranges())
         t_s = self._start_fleet_s + world.time_s
         imu_due, attitude_due = self._imu.due(world.step_index), self._attitude.due(world.step_index)
+        pressure_due = imu_due and self._pressure.due(world.step_index)
         for slot, agent_id in enumerate(scenario.ids):
             if attitude_due:
                 sensed.samples.append((agent_id, self._attitude_sample(slot, t_s)))
@@ -83,6 +87,9 @@ class SensorFeed:
                 imu = sensors.imu(slot)
                 sample = ImuSample(t_s, vector_of(imu.accel_mps2), vector_of(imu.gyro_rps))
                 sensed.samples.append((agent_id, sample))
+                # PX4 has the pressure in each HIGHRES_IMU, ArduPilot in messages of its own
+                if pressure_due or scenario.vehicles[slot].flavour == "px4":
+                    sensed.samples += [(agent_id, baro) for baro in _height(imu, t_s)]
         for slot, fix in sensors.fixes():
             if fix.valid:
                 self._aided_until_s[slot] = world.time_s + AIDED_S
@@ -107,3 +114,9 @@ class SensorFeed:
         simulation, world = self._simulation, self._simulation.world
         time_unix_s = simulation.start_s + world.time_s + simulation.unix_offset_s
         self._recorder.record(time_unix_s, *simulation.bodies())
+
+
+def _height(imu: SensedImu, t_s: float) -> list[BaroSample]:
+    """What the barometer beside an IMU says, if the vehicle has one and there is air."""
+    altitude_m = None if imu.pressure_hpa is None else pressure_altitude_m(imu.pressure_hpa)
+    return [] if altitude_m is None else [BaroSample(t_s, altitude_m)]

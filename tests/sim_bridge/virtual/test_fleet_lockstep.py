@@ -10,6 +10,7 @@ import pytest
 
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
+from agent.mavlink.session import PRESSURE_HZ
 from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from estimators.estimator import Status
@@ -128,3 +129,15 @@ def test_progress_counts_the_simulated_seconds() -> None:
     config = load_config(LINE3)
     FleetLockstep(config, make_estimator, lambda _agent, _ready: None).run(3.5, told.append)
     assert told == [pytest.approx(1.0), pytest.approx(2.0), pytest.approx(3.0)]
+
+
+@pytest.mark.parametrize("fidelity", ["values", "bytes"])
+def test_barometers_are_flown_with_in_either_fidelity_and_their_samples_add_up(fidelity: Fidelity) -> None:
+    flown = Flight('sim.profile="nom"', "estimator.systematic_errors=true", fidelity=fidelity, duration_s=4.0)
+    for agent_id, counters in flown.report.counters.items():
+        assert counters["baro: used"] == pytest.approx(2 * 4.0, abs=3)
+        came = {name: count for name, count in counters.items() if "baro: " in name}
+        samples, received = came.pop("baro: samples"), came.pop("baro: received")
+        assert sum(came.values()) == received >= samples
+        of_imu = flown.config.agent(agent_id).autopilot != "ardupilot"  # PX4 has it beside each of its samples
+        assert samples == pytest.approx(4.0 * (flown.config.mavlink.imu_hz if of_imu else PRESSURE_HZ), rel=0.15)

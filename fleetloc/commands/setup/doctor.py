@@ -36,6 +36,7 @@ def doctor(
     from fleetloc.config_check import check_document
     from fleetloc.doctor.examination import Mark, of_autopilot, of_computer
     from fleetloc.doctor.listening import listen
+    from fleetloc.doctor.radio_device import of_radio
     from fleetloc.errors import InputError
 
     document = load_document(config, overrides or (), profiles or ())
@@ -45,7 +46,7 @@ def doctor(
     fleet = checked.config
     if agent_id not in fleet.ids:
         raise InputError("--id", "", f"one of {', '.join(map(str, fleet.ids))} of {config}", str(agent_id))
-    lines = of_computer(fleet, checked.warnings)
+    lines = of_computer(fleet, checked.warnings) + of_radio(fleet, agent_id)
     heard = asyncio.run(listen(fleet, agent_id, config.parent, listen_s))
     lines += of_autopilot(fleet, agent_id, heard)
     for line in lines:

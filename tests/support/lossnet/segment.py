@@ -30,6 +30,9 @@ LONGEST_WAIT_S = 0.5
 TUNSETIFF, IFF_TAP, IFF_NO_PI = 0x400454CA, 0x0002, 0x1000
 MAC = bytes([2, 0, 0, 0, 0x77])
 ADDRESS_BYTES = 6
+SOLICITATIONS = 10
+"""How often a node asks for a neighbour's hardware address before it gives up, as docs/links.md advises; the kernel's
+three are all lost in one case of eight, and then it sends that neighbour nothing for seconds."""
 
 
 def address(node: int) -> str:
@@ -120,6 +123,9 @@ def _tap(namespace: str, node: int) -> int:
     ip("link", "set", name, "netns", namespace, "name", DEVICE)
     mac = ":".join(f"{byte:02x}" for byte in _mac(node))
     ip("-n", namespace, "link", "set", DEVICE, "address", mac, "mtu", str(MTU_BYTES), "up")
+    for kind in ("ucast_solicit", "mcast_solicit"):
+        setting = f"/proc/sys/net/ipv4/neigh/{DEVICE}/{kind}"
+        ip("netns", "exec", namespace, "sh", "-c", f"echo {SOLICITATIONS} > {setting}")
     ip("-n", namespace, "addr", "add", f"{address(node)}/24", "dev", DEVICE)
     return descriptor
 

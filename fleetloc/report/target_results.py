@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -93,28 +93,49 @@ def target_tracks(
 def _track(
     config: FleetConfig, directory: Path, truth: Truth, target_id: int, agent_id: int, ticks_expected: int
 ) -> TargetTrack:
+    kept = sorted(_seen(config, directory, truth, target_id, agent_id), key=lambda each: each.unix_s)
+    unix_s = np.array([each.unix_s for each in kept], np.float64)
+    place_m = np.array([each.position_m for each in kept], np.float64).reshape(-1, 3)
+    covariance_m2 = np.array([each.covariance_m2 for each in kept], np.float64).reshape(-1, 3, 3)
+    error_m = place_m - truth.at(unix_s)[:, truth.agents.index(target_id), :3]
+    squared = [nees(error, covariance) / 3.0 for error, covariance in zip(error_m, covariance_m2, strict=True)]
+    return TargetTrack(
+        target_id,
+        agent_id,
+        ticks_expected,
+        time_s=unix_s - float(truth.time_unix_s[0]),
+        position_m=place_m,
+        sigma_m=np.sqrt(np.diagonal(covariance_m2, axis1=1, axis2=2)),
+        error_m=error_m,
+        nees=np.array(squared, np.float64),
+        ok=np.array([each.ok for each in kept], np.bool_),
+    )
+
+
+class _Seen(NamedTuple):
+    """A target in one estimate of a drone."""
+
+    unix_s: float
+    position_m: Floats
+    covariance_m2: Floats
+    ok: bool
+
+
+def _seen(
+    config: FleetConfig, directory: Path, truth: Truth, target_id: int, agent_id: int
+) -> Iterator[_Seen]:
+    """The estimates of a drone, within the time of the truth, that the target was part of."""
     body, bodies, epoch_s = config.bodies.index(target_id), len(config.bodies), config.fleet.epoch_unix_s
     first_s, last_s = float(truth.time_unix_s[0]), float(truth.time_unix_s[-1])
-    columns: list[tuple[float, Floats, Floats, Floats, float, bool]] = []
     for part in run_files.readable_entries(directory, agent_id)[0]:
         for entry in part:
             unix_s = float(entry["t_s"]) + epoch_s
             gone = is_absent(entry["age_ticks"][body : body + 1])[0] or entry["status"] == Status.NO_DATA
             if gone or not first_s <= unix_s <= last_s:
                 continue
-            place = np.asarray(entry["mean"][position(body)], np.float64)
-            covariance = covariance_of(entry, bodies)[position(body), position(body)]
-            error = place - truth.at(unix_s)[truth.agents.index(target_id), :3]
-            sigma = np.sqrt(covariance.diagonal())
-            squared = nees(error, covariance) / 3.0
-            columns.append((unix_s - first_s, place, sigma, error, squared, entry["status"] == Status.OK))
-    columns.sort(key=lambda each: each[0])
-    time_s, nees_of, ok = (np.array([each[column] for each in columns], float) for column in (0, 4, 5))
-    place_m, sigma_m, error_m = (
-        np.array([each[column] for each in columns], float).reshape(-1, 3) for column in (1, 2, 3)
-    )
-    was_ok = np.asarray(ok > 0.0)
-    return TargetTrack(target_id, agent_id, ticks_expected, time_s, place_m, sigma_m, error_m, nees_of, was_ok)
+            covariance_m2 = covariance_of(entry, bodies)[position(body), position(body)]
+            place_m = np.asarray(entry["mean"][position(body)], np.float64)
+            yield _Seen(unix_s, place_m, covariance_m2, bool(entry["status"] == Status.OK))
 
 
 def target_cells(row: dict[str, Any]) -> list[str]:

@@ -1,7 +1,7 @@
 """Whether the device of the fleet's radio is there, and patient enough with hardware addresses for a lossy radio.
 
-Before it sends anything the kernel asks for the receiver's hardware address. Where all its questions are lost, nothing
-is sent to that neighbour for seconds, and no daemon can help (docs/links.md).
+Before it sends anything the kernel asks for the receiver's hardware address. Where all its questions are lost,
+nothing is sent to that neighbour for seconds, and no daemon can help (docs/links.md).
 """
 
 from __future__ import annotations

@@ -23,8 +23,8 @@ from fleetloc.report.fleet_results import FleetResults
 
 ROOT = Path(__file__).parents[2]
 JOB_PERIOD_S, JOB_S = 0.02, 0.0032
-"""A sixth of a core, as a daemon of line3 needs (`cpu_fraction` of the demo: 0.13 to 0.16), in pieces as long as those
-of its work."""
+"""A sixth of a core, as a daemon of line3 needs (`cpu_fraction` of the demo: 0.13 to 0.16), in pieces as long as
+those of its work."""
 BEGUN = b"begun\n"
 FORGOTTEN_S = 1.0
 """Jobs further behind are left out, as a daemon leaves out ticks."""

@@ -51,6 +51,8 @@ SHELLS_OF_SIMULATORS = ("sitl.md",)
 """Their blocks start ArduPilot and PX4."""
 BEFORE = {page: ["keys init fleet.toml"] for page in ("operating.md", "security.md", "uwb.md")}
 """Commands that a page takes for granted."""
+MAKES_ITS_FILE = "first-configuration.md"
+"""The page whose reader has no ``fleet.toml`` yet."""
 ASIDE = {"security.md": {"keys add fleet.toml --id 4": "[[agents]]\nid = 4\nmavlink = 'udpin:127.0.0.1:14554'\n"}}
 """What a reader adds to ``fleet.toml`` before a command, as the page says."""
 
@@ -116,9 +118,12 @@ def test_the_commands_of_a_page_do_what_they_say(
 ) -> None:
     """GIVEN the folder of a reader WHEN the commands of a page are run in its order THEN each ends well."""
     give_files(tmp_path)
+    if page == MAKES_ITS_FILE:
+        (tmp_path / "fleet.toml").unlink()
     for command in [*BEFORE.get(page, []), *commands_of(page)]:
         fleet = tmp_path / "fleet.toml"
-        fleet.write_text(fleet.read_text() + ASIDE.get(page, {}).get(command, ""))
+        if aside := ASIDE.get(page, {}).get(command):
+            fleet.write_text(fleet.read_text() + aside)
         inside = tmp_path / "records" if "../fleet.toml" in command else tmp_path
         monkeypatch.chdir(inside)
         code = main(arguments_of(command, inside))

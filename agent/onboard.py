@@ -325,7 +325,8 @@ class OnboardAgent:
         session, link = self.autopilot, self._follow(feeder)
         at_host_s = ready.t_s - self.clock.offset_s
         # PX4 puts stamps on its clock itself, by our answers to its TIMESYNC; ArduPilot takes them as they are
-        stamp_s = at_host_s if link.flavour == "px4" else session.clock.boot_s(at_host_s)
+        ahead_s = 0.0 if session.reads_stamps else host_s - at_host_s
+        stamp_s = at_host_s + ahead_s if link.flavour == "px4" else session.clock.boot_s(at_host_s)
         orientation = self.core.timeline.orientation_at(ready.t_s)
         own = block(self._config.bodies.index(self.agent_id))
         offered = Ready(
@@ -338,7 +339,9 @@ class OnboardAgent:
             statement=ready.integrity,
             quaternion=None if orientation is None else orientation.quaternion,
             stamp_us=None if stamp_s is None or stamp_s < 0.0 else round(stamp_s * 1e6),
-            gps_lost=self.core.gps_is_lost(self.fleet_s(host_s)),
+            # its own word comes before the fixes are missed
+            gps_lost=session.samples.without_fix or self.core.gps_is_lost(self.fleet_s(host_s)),
+            ahead_s=ahead_s,
         )
         frames = [session.encode(message) for message in feeder.on_estimate(offered, link, host_s)]
         self._look_around(host_s)

@@ -30,7 +30,7 @@ BY_NAME = {
     **dict.fromkeys(("--connect", "--router"), "ENDPOINT"),
     **dict.fromkeys(("--namespace", "--frame"), "NAME"),
     **dict.fromkeys((f"--{name}" for name in LISTS), "LIST"),
-    "--drop-gps": "ID[:FROM,TO]",
+    **dict.fromkeys(("--drop-gps", "--autopilot-gps"), "ID[:FROM,TO]"),
     "--estimator": "KIND",
     "--arrival": "WHEN",
     "--graph": "GRAPH",

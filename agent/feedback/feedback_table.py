@@ -40,3 +40,6 @@ class FeedbackTable(Table, frozen=True):
     switch_source: bool = False
     """Switch ArduPilot to its source set 2 when GPS is lost, and back to 1 after (MAV_CMD_SET_EKF_SOURCE_SET);
     without, the pilot does."""
+    tell_spoofing: bool = False
+    """Tell ArduPilot that its receiver is off where the fleet knows it (MAV_CMD_USER_1, as its pull request 33167 has
+    it); where it acknowledges, the estimate is fed. The ground station is told in any case."""

@@ -24,6 +24,7 @@ from agent.feedback.feedback_table import FEEDBACK_FITS
 from agent.feedback.fusion import FusionWatch
 from agent.feedback.gatekeeper import FeedPhase, FeedVerdict, Gatekeeper, Offer
 from agent.feedback.requirements import ParameterReader, Requirement, requirements
+from agent.feedback.spoofing import COMMAND, SpoofedReceiver
 from agent.mavlink.codec import Message, mavlink
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AutopilotEstimate, GpsSample, Quaternion, Sample
@@ -59,7 +60,8 @@ class Ready:
     """An estimate of the own drone at fleet time ``t_s``, ``now_s`` when it is out.
 
     ``mean`` ``(6,)`` and ``covariance`` ``(6, 6)`` NED in the fleet frame; ``quaternion`` is the autopilot's own
-    attitude at ``t_s``; ``stamp_us`` that instant on the clock which the autopilot expects, ``None`` if unknown.
+    attitude at ``t_s``; ``stamp_us`` that instant (and ``ahead_s``) on the clock which the autopilot expects,
+    ``None`` if unknown.
     """
 
     t_s: float
@@ -72,18 +74,21 @@ class Ready:
     quaternion: Quaternion | None
     stamp_us: int | None
     gps_lost: bool
+    ahead_s: float = 0.0
+    """What is sent is where it will be so much later than ``t_s``, to an autopilot that does not read stamps yet."""
 
 
 class Feeder:
     """The feed of one drone; ``counters`` says how many estimates were fed and why others were not."""
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
-        self._table = config.feedback
+        self._table, self._agent_id = config.feedback, agent_id
         self._frame = FleetFrame.of(config)
         self._component_id = config.mavlink.component_id
         self.watch = AutopilotWatch(self._frame)
         self.parameters = ParameterReader()
         self.fusion = FusionWatch()
+        self.receiver = SpoofedReceiver()
         self.verdict = FeedVerdict(FeedPhase.CHECKING, False, 0, "no estimate yet")
         self.unused = ""
         """Why the autopilot does not use what it is given, or would not."""
@@ -133,6 +138,7 @@ class Feeder:
         if self._life is not None and life != self._life:
             self.watch.reset()
             self.parameters.reset()
+            self.receiver.reset()
             self._gate.forget("begun anew")
             self._moves = 0
             self._origin_asked_s = float("-inf")
@@ -160,6 +166,9 @@ class Feeder:
             out.append(
                 mavlink.MAVLink_param_request_read_message(link.system_id, link.component_id, name.encode(), -1)
             )
+        told = self._table.tell_spoofing and self._flavour == "ardupilot"
+        if told and self.receiver.due(host_s):
+            out.append(_command(link, COMMAND, self.receiver.is_off, self._own_receiver))
         unswitched = self._sources != self._switched and self._switch_attempts < SWITCH_ATTEMPTS
         if unswitched and host_s - self._switch_asked_s >= SWITCH_RETRY_S:
             self._switch_asked_s = host_s
@@ -173,9 +182,11 @@ class Feeder:
             self._moves = self.watch.moves
             self._gate.forget("its origin moved")
         self.verdict = self._gate.judge(self._offer(ready, link, host_s))
+        if self.receiver.observe(self._receiver_off_m(ready), ready.now_s):
+            self._out.append(self._told_of_receiver())
         messages = self._encoded(ready, link) if self.verdict.feed else []
         if messages:
-            self.fusion.on_sent(ready.t_s, ready.now_s, ready.mean[:3])
+            self.fusion.on_sent(ready.t_s, ready.now_s, ready.mean[:3] + self.verdict.shift_m)
         self._count(bool(messages))
         self.unused = self.fusion.observe(
             self.verdict.phase, self._flavour, self.wanted, self.parameters.values, self.watch, ready.now_s, host_s
@@ -224,6 +235,8 @@ class Feeder:
             own_m=watch.own_at(ready.t_s),
             gps_lost=ready.gps_lost,
             fix_off_m=fix_off_m,
+            gps_off=self.receiver.is_off,
+            gps_unused=self.receiver.left_out,
         )
 
     def _why_not_good(self, ready: Ready) -> str:
@@ -250,14 +263,19 @@ class Feeder:
     def _encoded(self, ready: Ready, link: FedAutopilot) -> list[Message]:
         """The message for this autopilot; none where it cannot be made."""
         assert ready.stamp_us is not None
-        north, east, down = (float(each) for each in ready.mean[:3])
+        shift_m = self.verdict.shift_m
+        fed_m = ready.mean[:3] + ready.ahead_s * ready.mean[3:] + shift_m
+        north, east, down = (float(each) for each in fed_m)
         about_m = np.zeros(3) if self.watch.origin_m is None else np.array(self.watch.origin_m)
-        local = ready.mean[:3] - about_m
+        local = fed_m - about_m
+        ahead = np.eye(6) + ready.ahead_s * np.eye(6, k=3)
+        covariance = ahead @ ready.covariance @ ahead.T
+        covariance[:3, :3] += np.outer(shift_m, shift_m)  # so far is it from the estimate, knowingly
         state = FedState(
             ready.stamp_us,
             (float(local[0]), float(local[1]), float(local[2])),
             (float(ready.mean[3]), float(ready.mean[4]), float(ready.mean[5])),
-            ready.covariance,
+            covariance,
             self.verdict.reset_counter,
             ready.quaternion,
         )
@@ -290,7 +308,30 @@ class Feeder:
         if wanted != self._sources:
             self._sources, self._switch_attempts = wanted, 0
 
+    @property
+    def _own_receiver(self) -> int:
+        """The number of the receiver that is not ours."""
+        return 1 if self._table.kind == "gps_input" and self._table.gps_id == 0 else 0
+
+    def _receiver_off_m(self, ready: Ready) -> float | None:
+        """How far its fixes are off, by integrity or against what it is fed; ``None`` if nothing is known of that."""
+        statement = ready.statement
+        if statement is not None and statement.state in GOOD_STATES and self._agent_id in statement.off:
+            return statement.off[self._agent_id]
+        return self.verdict.gps_off_m if self.verdict.phase is FeedPhase.FEEDING else None
+
+    def _told_of_receiver(self) -> Message:
+        """What the ground station is told when its receiver is found to be off, or no longer."""
+        receiver = self.receiver
+        text = f"GPS {receiver.off_m:.0f} m off, spoofed or faulty" if receiver.is_off else "GPS agrees again"
+        severity = mavlink.MAV_SEVERITY_CRITICAL if receiver.is_off else mavlink.MAV_SEVERITY_INFO
+        return mavlink.MAVLink_statustext_message(severity, f"fleetloc: {text}"[:TEXT_CHARACTERS].encode())
+
     def _on_ack(self, message: Message) -> None:
+        if message.command == COMMAND:
+            accepted = message.result == mavlink.MAV_RESULT_ACCEPTED
+            self.receiver.on_ack(accepted)
+            self.counters[f"feedback: word on its receiver {'taken' if accepted else 'refused'}"] += 1
         if message.command == mavlink.MAV_CMD_SET_EKF_SOURCE_SET and self._switch_attempts:
             accepted = message.result == mavlink.MAV_RESULT_ACCEPTED
             self.counters[f"feedback: source set {'switched' if accepted else 'refused'}"] += 1
@@ -310,7 +351,7 @@ class Feeder:
         return [mavlink.MAVLink_statustext_message(severity, text.encode("ascii", "replace"))]
 
 
-def _command(link: FedAutopilot, number: int, parameter: float) -> Message:
+def _command(link: FedAutopilot, number: int, parameter: float, second: float = 0.0) -> Message:
     return mavlink.MAVLink_command_long_message(
-        link.system_id, link.component_id, number, 0, float(parameter), 0, 0, 0, 0, 0, 0
+        link.system_id, link.component_id, number, 0, float(parameter), float(second), 0, 0, 0, 0, 0
     )

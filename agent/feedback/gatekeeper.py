@@ -16,12 +16,13 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 import numpy as np
 
 from agent.feedback.feedback_table import FeedbackTable
+from agent.feedback.handover import Handover
 from estimators.integrity.protection.levels import ProtectionLevel
 from estimators.model.measurements import Vector
 
@@ -34,6 +35,8 @@ FARTHEST_ORIGIN_M = 10_000.0
 STALE_S = 0.5
 """An estimate older than this is not fed, and after so long without one the feed has stopped."""
 STEP_WINDOW_S = 1.0
+REMEMBERED_S = 30.0
+"""A receiver that is found to be off may have pulled the autopilot away from the estimate for so long already."""
 
 
 class FeedPhase(StrEnum):
@@ -51,10 +54,11 @@ class FeedPhase(StrEnum):
 class Offer:
     """An estimate that could be fed, and what is known of the autopilot at its instant; positions in the fleet frame.
 
-    ``t_s`` is fleet time of the estimate, ``now_s`` that of the offer. ``bad``: why the
-    estimate is not good, empty if it is. ``autopilot``: why its link or origin cannot be used, empty if they can.
-    ``own_m``: the autopilot's own position then. ``gps_lost``: whether no fix comes; ``fix_off_m``: how far the
-    latest fix is from the estimate.
+    ``t_s`` is fleet time of the estimate, ``now_s`` that of the offer. ``bad``: why the estimate is not good, empty
+    if it is. ``autopilot``: why its link or origin cannot be used, empty if they can. ``own_m``: the autopilot's own
+    position then. ``gps_lost``: whether no fix comes; ``fix_off_m``: how far the latest fix is from the estimate.
+    ``gps_off``: whether its receiver is known to be off, so that its own position says nothing; ``gps_unused``:
+    whether the autopilot knows that too and leaves its fixes out.
     """
 
     t_s: float
@@ -68,6 +72,13 @@ class Offer:
     own_m: Vector | None
     gps_lost: bool
     fix_off_m: float | None
+    gps_off: bool = False
+    gps_unused: bool = False
+
+    @property
+    def without_gps(self) -> bool:
+        """Whether nothing but a feed holds the autopilot's position."""
+        return self.gps_lost or self.gps_unused
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,6 +91,8 @@ class FeedVerdict:
     reason: str = ""
     gps_off_m: float | None = None
     """How far the autopilot's GPS, which is back, is from the estimate that it contradicts."""
+    shift_m: Vector = field(default_factory=lambda: np.zeros(3))
+    """To be added to the position ``(3,)`` NED, so that a feed begins where the autopilot believes to be."""
 
 
 class Gatekeeper:
@@ -93,6 +106,8 @@ class Gatekeeper:
         self.resets = 1
         """Counter that goes with what is fed; not zero, so that a decoder that fills fields up is seen."""
         self._checked = False
+        self._held_s = -math.inf
+        """When it agreed last."""
         self._good_since_s: float | None = None
         self._apart: deque[tuple[float, Vector]] = deque()
         """Estimate less the autopilot's own position, while its GPS was good."""
@@ -100,6 +115,7 @@ class Gatekeeper:
         self._steps: deque[tuple[float, Vector]] = deque()
         """Corrections of the position within the last second."""
         self._last_fed_s = -math.inf
+        self._handover = Handover()
         self._gps_agrees_since_s: float | None = None
         self._why = "not checked yet"
 
@@ -108,24 +124,34 @@ class Gatekeeper:
         self.phase, self._checked, self._why = FeedPhase.CHECKING, False, why
         self._good_since_s = self._gps_agrees_since_s = None
         self._last = None
+        self._held_s = -math.inf
         self._apart.clear()
         self._steps.clear()
 
     def judge(self, offer: Offer) -> FeedVerdict:
         """What becomes of an estimate."""
         bad = self._why_bad(offer)
+        if self.phase is FeedPhase.FEEDING:
+            self._steps.append((offer.t_s, self._handover.go_on(offer.t_s)))
         jump = self._jumped(offer) if not bad else False
         self._good_since_s = None if bad else (offer.now_s if self._good_since_s is None else self._good_since_s)
-        if not (offer.gps_lost or bad or self.phase in (FeedPhase.FEEDING, FeedPhase.WITHHELD)):
-            self._compare(offer)  # afterwards it would be compared with itself
+        waits = self.phase in (FeedPhase.FEEDING, FeedPhase.WITHHELD)  # then it would be compared with itself
+        if offer.gps_off and not waits:
+            self._checked = offer.now_s - self._held_s <= REMEMBERED_S
+        elif not (offer.without_gps or bad or waits):
+            self._compare(offer)
         gps_off_m = self._returned_gps(offer, bad)
+        fed_before = self.phase is FeedPhase.FEEDING
         feed = self._step(offer, bad)
+        if not (fed_before and feed):
+            self._hand_over(offer)
         if feed and (jump or self._last_fed_s < offer.now_s - STALE_S):
             self.resets = (self.resets + 1) % 256
             self._steps.clear()
         if feed:
             self._last_fed_s = offer.now_s
-        return FeedVerdict(self.phase, feed, self.resets, "" if feed else self._why, gps_off_m)
+        why = "" if feed else self._why
+        return FeedVerdict(self.phase, feed, self.resets, why, gps_off_m, self._handover.shift_m)
 
     # --- is it good? --------------------------------------------------------------------------------------------
 
@@ -185,6 +211,7 @@ class Gatekeeper:
             self._uncheck(f"estimate {vertical_m:.1f} m above or below its own position: heights")
         elif self._covers(self._apart):
             self._checked = True
+            self._held_s = offer.now_s
         elif not self._checked:
             self._why = "not checked yet"
 
@@ -210,6 +237,14 @@ class Gatekeeper:
             self._gps_agrees_since_s = offer.now_s
         return None
 
+    def _hand_over(self, offer: Offer) -> None:
+        """The first position that is fed is the autopilot's own; what is ready is held there."""
+        if self.phase is FeedPhase.FEEDING:
+            apart_m = None if offer.own_m is None else offer.position_m - offer.own_m
+        else:
+            apart_m = np.mean([each for _, each in self._apart], axis=0) if self._apart else None
+        self._handover.begin(apart_m, offer.t_s)
+
     def _step(self, offer: Offer, bad: str) -> bool:
         """Go on by one estimate; whether it is fed."""
         waits_for_gps = self.phase in (FeedPhase.FEEDING, FeedPhase.WITHHELD)
@@ -217,7 +252,7 @@ class Gatekeeper:
         # without a feed there is nothing to hand back
         held_s = 0.0 if self.phase is FeedPhase.WITHHELD else self._table.agree_s
         gps_is_back = since_s is not None and offer.now_s - since_s >= held_s
-        if not offer.gps_lost and (not waits_for_gps or gps_is_back):
+        if not offer.without_gps and (not waits_for_gps or gps_is_back):
             self.phase = FeedPhase.READY if self._checked and not bad else FeedPhase.CHECKING
             self._why = bad or ("" if self._checked else self._why)
             return self._standby and self.phase is FeedPhase.READY

@@ -56,7 +56,7 @@ _PX4_ODOMETRY = (
 _PX4_GLOBAL = (
     Requirement("EKF2_AGP0_ID", _is(1), "1", "the id in our messages"),
     Requirement("EKF2_AGP0_CTRL", _has_bit(0), "1 (bit 0: horizontal position)", "else no position"),
-    Requirement("EKF2_AGP0_NOISE", lambda v: v <= 1.0, "1.0 or less", "no smaller one is believed", needed=False),
+    Requirement("EKF2_AGP0_NOISE", lambda v: v <= 0.5, "0.3", "no error counts as smaller", needed=False),
     Requirement(
         "EKF2_AGP0_DELAY", lambda v: 100 <= v <= 250, "150", "it is stamped by its arrival",
         reboot=True, needed=False,

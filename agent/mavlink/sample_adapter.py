@@ -85,6 +85,8 @@ class _HeardReceiver:
 
     number: int
     """From 0."""
+    has_fix: bool | None = None
+    """Whether its last message said that it has a fix; ``None``: none came."""
     last_fix: tuple[int, ...] = ()
     """Time, place and velocity, as sent."""
     repeats: int = 0
@@ -140,6 +142,11 @@ class SampleAdapter:
         self.aided = True
         """Whether the autopilot's own estimator is aided by positions, by its last word."""
         self._was_aided = False
+
+    @property
+    def without_fix(self) -> bool:
+        """Whether all receivers that spoke last said that they have no fix."""
+        return {receiver.has_fix for receiver in self._receivers} - {None} == {False}
 
     @property
     def frozen(self) -> bool:
@@ -274,6 +281,7 @@ class SampleAdapter:
             return self._skip("gps: given by us")
         fix = (message.time_usec, message.lat, message.lon, message.alt, message.vel, message.cog)
         lost = not self._has_fix(message)  # ArduPilot says so with the time and place of the last one
+        receiver.has_fix = not lost
         if not lost and message.time_usec and fix == receiver.last_fix:
             return self._skip("gps: sent again")
         sample = self._no_fix("gps: no fix") if lost else self._fix(message, arrival_s, receiver)

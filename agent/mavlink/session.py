@@ -46,6 +46,8 @@ FED_POSITION_HZ, FED_STATUS_HZ = 10.0, 5.0
 PRESSURE_HZ = 4.0
 GROUND_HZ = 5.0
 ESTIMATOR_STATUS_HZ = 2.0
+CONVERGED_ANSWERS = 600
+"""PX4's TIMESYNC filter needs 500 of our answers, 50 s; some that took long do not count."""
 """Whether the autopilot's attitude is aided: an attitude without positions is tilted within a second."""
 _ESTIMATOR_STATUS = {
     "px4": mavlink.MAVLINK_MSG_ID_ESTIMATOR_STATUS,
@@ -128,6 +130,8 @@ class AutopilotSession:
         self._doubtful: list[tuple[float, float]] = []
         """The same of the last ones that do not fit it."""
         self._someone_else_answers = False
+        self._answered = 0
+        """TIMESYNC requests of its present clock that we answered."""
         self._answers: list[bytes] = []
 
     @property
@@ -238,6 +242,13 @@ class AutopilotSession:
             if flavour in _ESTIMATOR_STATUS:
                 self.rates.add(_ESTIMATOR_STATUS[flavour], FED_STATUS_HZ if self._fed else ESTIMATOR_STATUS_HZ)
 
+    @property
+    def reads_stamps(self) -> bool:
+        """Whether the autopilot puts our stamps on its clock by now: PX4 takes a message for one of its arrival until
+        its TIMESYNC filter has converged."""
+        px4 = self.autopilot is not None and self.autopilot.flavour == "px4"
+        return not px4 or self._answered >= CONVERGED_ANSWERS
+
     def _is_better(self, found: AutopilotId, now_s: float) -> bool:
         """Whether another component is rather the autopilot than the one that was taken for it."""
         assert self.autopilot is not None
@@ -258,6 +269,7 @@ class AutopilotSession:
         self._forget_clock()
 
     def _forget_clock(self) -> None:
+        self._answered = 0
         self.clock.reset()
         self.samples.reset()
         self._boot, self._doubtful = None, []
@@ -275,6 +287,7 @@ class AutopilotSession:
         if not self._someone_else_answers:
             answer = mavlink.MAVLink_timesync_message(round(now_s * 1e9), message.ts1)
             self._answers.append(self._encoder.encode(answer))
+            self._answered += 1
 
     def _on_ack(self, message: Message, now_s: float) -> None:
         mine = (self._encoder.system_id, self._encoder.component_id)

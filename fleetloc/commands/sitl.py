@@ -37,6 +37,10 @@ def sitl(
         list[str] | None,
         typer.Option("--drop-gps", help="No GPS for this daemon then, s from the begin; may be repeated."),
     ] = None,
+    autopilot_gps: Annotated[
+        list[str] | None,
+        typer.Option("--autopilot-gps", help="No GPS for this autopilot itself then; may be repeated."),
+    ] = None,
     seed: Annotated[int | None, typer.Option("--seed", help="Of the ranges and of injected faults.")] = None,
     loss: Loss = None,
     delay_s: Delay = None,
@@ -65,7 +69,7 @@ def sitl(
         ("--delay", "transport.delay_s", delay_s),
     ]
     loaded = load_whole(config, with_options(options, overrides), profiles or ())
-    fleet = _prepared(config, loaded, mission, drop_gps or [], duration_s)
+    fleet = _prepared(config, loaded, mission, (drop_gps or [], autopilot_gps or []), duration_s)
     folder = _write_folder((config, *(profiles or ())), fleet, out)
     announce()
     warm_up_everything()
@@ -81,9 +85,14 @@ def sitl(
 
 
 def _prepared(
-    file: Path, fleet: FleetConfig, mission: str | None, drop_gps: list[str], duration_s: float | None
+    file: Path,
+    fleet: FleetConfig,
+    mission: str | None,
+    without_gps: tuple[list[str], list[str]],
+    duration_s: float | None,
 ) -> FleetConfig:
-    """The effective configuration, checked as far as that is possible before anything is started."""
+    """The effective configuration, checked as far as that is possible before anything is started; which daemons and
+    which autopilots are without GPS when."""
     import msgspec
 
     from agent.config.reading import with_other_table
@@ -100,12 +109,18 @@ def _prepared(
     wanted = None if mission == NO_MISSION else mission
     if mission is None and sitl.mission is not None:
         wanted = str(file.parent / sitl.mission)
-    sitl = replace(sitl, mission=None if wanted is None else str(Path(wanted).resolve()))
+    daemons, autopilots = without_gps
+    taken = tuple(gps_outage(text, fleet.ids, duration_s, "--autopilot-gps") for text in autopilots)
+    sitl = replace(
+        sitl,
+        mission=None if wanted is None else str(Path(wanted).resolve()),
+        autopilot_gps=sitl.autopilot_gps + taken,
+    )
     fleet = with_other_table(fleet, "sitl", sitl)
     if wanted is not None:
         load_mission(Path(wanted), fleet)
         require_client()
-    outages = tuple(gps_outage(text, fleet.ids, duration_s) for text in drop_gps)
+    outages = tuple(gps_outage(text, fleet.ids, duration_s) for text in daemons)
     return with_other_table(fleet, "sim", replace(sim, gps_outages=sim.gps_outages + outages))
 
 

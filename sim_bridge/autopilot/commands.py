@@ -70,6 +70,7 @@ class CommandHandler:
         }
         if state.flavour.name == "ardupilot":
             self._handlers[mavlink.MAV_CMD_SET_EKF_SOURCE_SET] = self._set_source
+            self._handlers[mavlink.MAV_CMD_USER_1] = self._hear_of_spoofing
 
     def handle(self, command: Command, now: float) -> int:
         """Carry a command out; the MAV_RESULT of its acknowledgement."""
@@ -198,4 +199,15 @@ class CommandHandler:
         if command.params[0] not in (1.0, 2.0, 3.0):
             return DENIED
         self._state.feed.source_set = int(command.params[0])
+        return ACCEPTED
+
+    def _hear_of_spoofing(self, command: Command, _now: float) -> int:
+        """As ArduPilot's pull request 33167 has it; released firmware knows no such command."""
+        if not self._state.hears_of_spoofing:
+            return UNSUPPORTED
+        spoofed, receiver = command.params[:2]
+        if spoofed not in (0.0, 1.0) or receiver not in (0.0, 1.0):
+            return DENIED
+        if receiver == 0.0:
+            self._state.feed.spoofed = bool(spoofed)
         return ACCEPTED

@@ -2,8 +2,8 @@
 
 PX4: ODOMETRY in four local frames from a vision estimator, VISION_POSITION_ESTIMATE; it wants less than
 0.2 s between samples to start and stops after 0.4 s. ArduPilot: ODOMETRY only as LOCAL_FRD/BODY_FRD (anything
-else is dropped without a word) and VISION_POSITION_ESTIMATE, healthy for 0.3 s. VISION_SPEED_ESTIMATE and
-GPS_INPUT are not simulated: they are counted as not handled, as PX4 does.
+else is dropped without a word) and VISION_POSITION_ESTIMATE, healthy for 0.3 s. VISION_SPEED_ESTIMATE is not
+simulated: it is counted as not handled, as PX4 does. GLOBAL_POSITION_SENSOR and GPS_INPUT: `global_feed`.
 """
 
 from __future__ import annotations
@@ -75,6 +75,8 @@ class ExternalFeed:
         self.rejected: Counter[str] = Counter()
         self.reset_counter: int | None = None
         self.source_set = 1
+        self.spoofed = False
+        """Whether it was told that its own receiver is lied to."""
         self._last_s = -math.inf
         self._fusing = False
 
@@ -110,7 +112,13 @@ class ExternalFeed:
         """Whether navigation uses its own receiver: PX4 by EKF2_GPS_CTRL, ArduPilot by its source set."""
         if self._flavour.name == "px4":
             return bool(int(self._parameter("EKF2_GPS_CTRL")) & 1)
-        return self._parameter(f"EK3_SRC{min(self.source_set, 2)}_POSXY") == 3
+        return not self.spoofed and self._parameter(f"EK3_SRC{min(self.source_set, 2)}_POSXY") == 3
+
+    def uses_height(self) -> bool:
+        """Whether navigation takes the feed's height: PX4 by EKF2_EV_CTRL, ArduPilot by its source set."""
+        if self._flavour.name == "px4":
+            return bool(int(self._parameter("EKF2_EV_CTRL")) & 2)
+        return self._parameter("EK3_SRC2_POSZ") == 6
 
     def healthy(self, now: float) -> bool:
         """Whether samples came lately enough for the autopilot."""

@@ -30,6 +30,10 @@ from sim_bridge.world.sensors import GpsFix, quaternion_of, vector_of
 
 COMPONENT = int(mavlink.MAV_COMP_ID_AUTOPILOT1)
 HEARTBEAT_S = 1.0
+SIM_GPS: dict[FlavourName, str] = {"px4": "SIM_GPS_USED", "ardupilot": "SIM_GPS1_ENABLE"}
+"""With this parameter at zero their simulators take GPS away."""
+GPS_TIMEOUT_S = 4.0
+"""ArduPilot takes a receiver that is silent for so long for one without a fix."""
 GPS_SILENCE_S = 1.0
 """PX4 says that its receiver is gone after this long without a fix."""
 WGS84_INT_SCALE = 1e-7
@@ -101,7 +105,8 @@ class FakeAutopilot:
             "ODOMETRY": self._on_feed,
             "VISION_POSITION_ESTIMATE": self._on_feed,
             "VISION_SPEED_ESTIMATE": self._on_feed,
-            "GPS_INPUT": self._on_feed,
+            "GPS_INPUT": self._on_receiver,
+            "GLOBAL_POSITION_SENSOR": self._on_global_sensor,
             "HEARTBEAT": lambda _message, _now: None,
         }
         self._boot(now)
@@ -124,6 +129,9 @@ class FakeAutopilot:
         self._heartbeat_s = self._timesync_s = now
         self._last_fix: tuple[GpsFix, float] | None = None
         self._last_fix_s = now
+        self._has_barometer = False
+        self._first_is_valid = False
+        """Whether the own receiver's last word was a fix."""
         self._now = now
 
     @property
@@ -175,7 +183,10 @@ class FakeAutopilot:
         if self._is_down(now):
             return
         state = self.state
+        if self._parameters.value(SIM_GPS[state.flavour.name]) == 0.0:
+            fix = GpsFix(fix.time_s, False)
         self._last_fix = (fix, taken_s)
+        self._first_is_valid = fix.valid
         if fix.valid:
             self._last_fix_s = now
             if not self.setup.fusing or state.feed.uses_gps():
@@ -216,6 +227,9 @@ class FakeAutopilot:
             attitude, imu = navigation.attitude(self._vehicle.attitude()), self._vehicle.imu()
             north, east, down = rotated(quaternion_of(attitude), vector_of(imu.accel_mps2))
             navigation.predict(np.array((north, east, down + self.setup.gravity_mps2)), now)
+            self._has_barometer = imu.pressure_hpa is not None
+            if self._has_barometer:
+                navigation.on_height(self.state.down_of_msl(imu.pressure_alt_m), now)
 
     def _look_after_position(self, now: float) -> None:
         """The estimator's failsafe, where it has one: of an armed vehicle that was once located and is in the air."""
@@ -364,8 +378,11 @@ class FakeAutopilot:
         held_by_gps = now - self._last_fix_s < GPS_SILENCE_S and not self.setup.fusing
         taken_s = state.feed_clock.taken_s(getattr(message, "time_usec", getattr(message, "usec", 0)), now)
         if fed is not None and origin_m is not None and state.feed.fused(now) and not held_by_gps:
+            position_m = origin_m + fed.position_m
+            if self._has_barometer and not state.feed.uses_height():
+                position_m[2] = np.nan
             outside = OutsideState(
-                origin_m + fed.position_m,
+                position_m,
                 fed.velocity_mps,
                 fed.position_sigma_m,
                 fed.velocity_sigma_mps,
@@ -373,6 +390,18 @@ class FakeAutopilot:
                 int(message.reset_counter),
             )
             state.navigation.on_outside(outside, now)
+
+
+    def _on_global_sensor(self, message: Message, now: float) -> None:
+        outside = self.state.global_feed.of_sensor(message, now)
+        if outside is not None and self.setup.fusing:
+            self.state.navigation.on_outside(outside, now)
+
+    def _on_receiver(self, message: Message, now: float) -> None:
+        first_has_fix = self._first_is_valid and now - self._last_fix_s < GPS_TIMEOUT_S
+        fix = self.state.global_feed.of_receiver(message, now, first_has_fix)
+        if fix is not None and self.setup.fusing:
+            self.state.navigation.on_fix(fix, now)
 
 
 def _text(name: bytes | str) -> str:

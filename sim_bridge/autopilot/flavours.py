@@ -114,7 +114,12 @@ PX4 = Flavour(
         "EKF2_EV_NOISE_MD": Parameter(0),
         "EKF2_EV_QMIN": Parameter(0),
         "EKF2_GPS_CTRL": Parameter(7),
+        "EKF2_AGP0_ID": Parameter(1),
+        "EKF2_AGP0_CTRL": Parameter(1),
+        "EKF2_AGP0_NOISE": Parameter(1.0, integer=False),
+        "EKF2_AGP0_DELAY": Parameter(150.0, integer=False),
         "EKF2_HGT_REF": Parameter(1),
+        "SIM_GPS_USED": Parameter(10),
     },
     takeoff_height_parameter="MIS_TAKEOFF_ALT",
 )
@@ -165,6 +170,9 @@ ARDUPILOT = Flavour(
     parameters={
         "SYSID_THISMAV": Parameter(1),
         "GPS1_TYPE": Parameter(1),
+        "GPS2_TYPE": Parameter(14),
+        "SIM_GPS1_ENABLE": Parameter(1),
+        "GPS_AUTO_SWITCH": Parameter(4),
         "VISO_TYPE": Parameter(1),
         "VISO_POS_M_NSE": Parameter(0.2, integer=False),
         "VISO_VEL_M_NSE": Parameter(0.1, integer=False),
@@ -173,6 +181,7 @@ ARDUPILOT = Flavour(
         "EK3_SRC1_POSXY": Parameter(3),
         "EK3_SRC2_POSXY": Parameter(6),
         "EK3_SRC2_VELXY": Parameter(6),
+        "EK3_SRC2_POSZ": Parameter(1),
         "EK3_SRC2_YAW": Parameter(1),
     },
 )

@@ -18,7 +18,7 @@ from sim_bridge.world.quaternions import Array
 from sim_bridge.world.sensors import GpsFix
 
 ACCEL_SIGMA_MPS2 = 0.35
-POSITION_GATE, VELOCITY_GATE = 5.0, 3.0
+GPS_GATE, VELOCITY_GATE = 5.0, 3.0
 START_SIGMA_M, START_SIGMA_MPS = 1.0, 0.5
 REMEMBERED_S = 1.0
 """How old a position may be and still be put where it belongs."""
@@ -26,6 +26,8 @@ GPS_STOPPED_S = 1.0
 """Without a fix for so long, GPS holds nothing any more, and a feed that begins sets the state."""
 GPS_SPEED_SIGMA_MPS = 0.3
 LEAST_SIGMA_M, LEAST_SIGMA_MPS = 0.1, 0.1
+BAROMETER_SIGMA_M, BAROMETER_EVERY_S, BAROMETER_SHARE = 0.5, 0.1, 0.05
+"""While GPS gives heights, the barometer's offset follows them by this share of each sample."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,13 +40,15 @@ class LossFigures:
     """It lands."""
     refused_s: float
     """Positions that were refused for so long are set, not fused, if nothing else holds the state."""
+    gps_delay_s: float
+    """Its own fixes are taken for so old when they come: EKF2_GPS_DELAY; ArduPilot's lag of a receiver."""
     returns_after_s: float | None
     """Its earlier mode comes back when it has positions again for so long; ``None``: it stays in LAND."""
 
 
 FIGURES: dict[FlavourName, LossFigures] = {
-    "px4": LossFigures(flag_s=0.7, failsafe_s=4.5, refused_s=1.0, returns_after_s=2.0),
-    "ardupilot": LossFigures(flag_s=7.0, failsafe_s=8.0, refused_s=7.0, returns_after_s=None),
+    "px4": LossFigures(flag_s=0.7, failsafe_s=4.5, refused_s=1.0, gps_delay_s=0.11, returns_after_s=2.0),
+    "ardupilot": LossFigures(flag_s=7.0, failsafe_s=8.0, refused_s=7.0, gps_delay_s=0.2, returns_after_s=None),
 }
 
 
@@ -64,6 +68,8 @@ class FusingNavigation(Navigation):
         self._gps_s = self._refused_since_s = -np.inf
         self._feed_s = -np.inf
         self._reset_counter: int | None = None
+        self._barometer_off_m: float | None = None
+        self._height_s = -np.inf
 
     def aided(self, now: float) -> bool:
         """Whether a position was used lately enough for this autopilot."""
@@ -100,8 +106,23 @@ class FusingNavigation(Navigation):
             self.set_origin(position)
             self.velocity_mps = velocity
         alone = now - self._feed_s > GPS_STOPPED_S
-        if self._use(position, velocity, sigmas, np.full(3, GPS_SPEED_SIGMA_MPS), now, now, alone):
+        taken_s = now - self.figures.gps_delay_s
+        if self._use(position, velocity, sigmas, np.full(3, GPS_SPEED_SIGMA_MPS), taken_s, now, alone, GPS_GATE):
             self._gps_s = now
+
+    def on_height(self, down_m: float, now: float) -> None:
+        """Use the height of its barometer: about that of GPS while there is one, as it was then without."""
+        if self.origin_m is None or now - self._height_s < BAROMETER_EVERY_S:
+            return
+        self._height_s = now
+        off_m = down_m - float(self.position_m[2])
+        if self._barometer_off_m is None:
+            self._barometer_off_m = off_m
+        elif now - self._gps_s <= GPS_STOPPED_S:
+            self._barometer_off_m += BAROMETER_SHARE * (off_m - self._barometer_off_m)
+        else:
+            sigmas = np.array((np.inf, np.inf, BAROMETER_SIGMA_M))
+            self._fuse(0, np.array((0.0, 0.0, off_m - self._barometer_off_m)), sigmas)
 
     def on_outside(self, outside: OutsideState, now: float) -> None:
         """Use a position from outside."""
@@ -120,7 +141,8 @@ class FusingNavigation(Navigation):
             return
         sigmas = np.maximum(outside.position_sigma_m, LEAST_SIGMA_M)
         speeds = np.maximum(outside.velocity_sigma_mps, LEAST_SIGMA_MPS)
-        if self._use(outside.position_m, outside.velocity_mps, sigmas, speeds, outside.taken_s, now, alone):
+        place, moves = outside.position_m, outside.velocity_mps
+        if self._use(place, moves, sigmas, speeds, outside.taken_s, now, alone, outside.gate):
             self._feed_s = now
 
     def _use(
@@ -132,16 +154,20 @@ class FusingNavigation(Navigation):
         taken_s: float,
         now: float,
         alone: bool,
+        gate: float,
     ) -> bool:
         """Fuse a position (and velocity) taken at ``taken_s``, or refuse it; whether it was used."""
         then_m, then_mps = self._at(taken_s)
-        off_m = position_m - then_m
-        gate = POSITION_GATE**2 * (self._covariance[:, 0, 0] + sigma_m**2)
-        self._ratio = float(np.max((off_m**2 / gate)[:2]))
+        given = np.isfinite(position_m)
+        off_m = np.where(given, position_m - then_m, 0.0)
+        sigma_m = np.where(given, sigma_m, np.inf)
+        limit = gate**2 * (self._covariance[:, 0, 0] + sigma_m**2)
+        self._ratio = float(np.max((off_m**2 / limit)[:2]))
         if self._ratio > 1.0:
             self.refused += 1
             self._refused_since_s = now if self._refused_since_s == -np.inf else self._refused_since_s
-            if not (alone and now - self._refused_since_s >= self.figures.refused_s):
+            forsaken = self.unaided_s(now) > self.figures.failsafe_s  # it begins anew with what comes
+            if not (forsaken or (alone and now - self._refused_since_s >= self.figures.refused_s)):
                 return False
             self._set(position_m, velocity_mps, taken_s, now)
             return True
@@ -172,7 +198,8 @@ class FusingNavigation(Navigation):
         """A reset: the state is what came, carried on to now."""
         then_m, then_mps = self._at(taken_s)
         shift_mps = np.zeros(3) if velocity_mps is None else velocity_mps - then_mps
-        self._shift(position_m - then_m + (now - taken_s) * shift_mps, shift_mps)
+        off_m = np.where(np.isfinite(position_m), position_m - then_m, 0.0)
+        self._shift(off_m + (now - taken_s) * shift_mps, shift_mps)
         self._covariance[:] = np.diag((START_SIGMA_M**2, START_SIGMA_MPS**2))
         self._refused_since_s = -np.inf
         self._aided_s = now

@@ -22,7 +22,10 @@ VELOCITY_FROM_POSITION_PER_S = 0.3
 
 @dataclass(frozen=True, slots=True)
 class OutsideState:
-    """A position from outside in the fleet frame, NED, its 1-sigmas per axis, and the instant it is taken for."""
+    """A position from outside in the fleet frame, NED, its 1-sigmas per axis, and the instant it is taken for.
+
+    An axis that is NaN is not used; an innovation above ``gate`` sigmas is refused.
+    """
 
     position_m: Array
     velocity_mps: Array | None
@@ -30,6 +33,7 @@ class OutsideState:
     velocity_sigma_mps: Array
     taken_s: float
     reset_counter: int
+    gate: float = 5.0
 
 
 class Navigation:
@@ -90,9 +94,13 @@ class Navigation:
             self.velocity_mps = self.velocity_mps + VELOCITY_GAIN * (velocity_mps - self.velocity_mps)
         self._aided_s = now
 
+    def on_height(self, down_m: float, now: float) -> None:
+        """The height of the autopilot's barometer, which this filter does not use."""
+
     def on_outside(self, outside: OutsideState, now: float) -> None:
         """Use a position from outside, as if it were of now."""
-        self.correct(outside.position_m, outside.velocity_mps, now)
+        known = np.where(np.isfinite(outside.position_m), outside.position_m, self.position_m)
+        self.correct(known, outside.velocity_mps, now)
 
     def on_fix(self, fix: GpsFix, now: float) -> None:
         """Use a valid fix of the autopilot's own receiver."""

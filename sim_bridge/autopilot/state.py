@@ -12,6 +12,7 @@ from sim_bridge.autopilot.failsafe import EstimatorFailsafe
 from sim_bridge.autopilot.feed_clock import FeedClock
 from sim_bridge.autopilot.flavours import Flavour, FlightMode, Parameter
 from sim_bridge.autopilot.fusing import FIGURES, FusingNavigation
+from sim_bridge.autopilot.global_feed import GlobalFeed
 from sim_bridge.autopilot.navigation import Navigation
 from sim_bridge.autopilot.streams import StreamTable
 from sim_bridge.autopilot.truth_messages import TrueState
@@ -152,10 +153,13 @@ class AutopilotState:
         self.failsafe = EstimatorFailsafe(FIGURES[flavour.name]) if fusing else None
         self.feed_clock = FeedClock(flavour.name, parameters.value)
         self.feed = ExternalFeed(flavour, parameters.value)
+        self.global_feed = GlobalFeed(flavour.name, parameters.value, self.fleet_ned)
         self.armed = airborne
         self.mode = FlightMode.MISSION if airborne else FlightMode.HOLD
         self.home_m: Array | None = None
         self.reboot_asked = False
+        self.hears_of_spoofing = False
+        """Whether it is a firmware that can be told that its receiver is spoofed."""
 
     def geodetic(self, position_m: Array) -> tuple[float, float, float]:
         """Latitude and longitude in deg and MSL height in m of a point in the fleet frame."""
@@ -166,3 +170,7 @@ class AutopilotState:
     def fleet_ned(self, lat_deg: float, lon_deg: float, alt_msl_m: float) -> tuple[float, float, float]:
         """The point in the fleet frame at latitude, longitude and MSL height."""
         return self.frame.ned(lat_deg, lon_deg, geodesy.from_msl_m(self.frame, alt_msl_m))
+
+    def down_of_msl(self, alt_msl_m: float) -> float:
+        """How far below the fleet's origin a height above mean sea level is."""
+        return self.frame.alt_m - geodesy.from_msl_m(self.frame, alt_msl_m)

@@ -20,7 +20,7 @@ from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.sitl.vehicle import SitlVehicle, VehicleReport
 from sim_bridge.sitl.world import SitlWorld
 from sim_bridge.world.range_sessions import open_range_sessions
-from sim_bridge.world.sim_table import sim_table
+from sim_bridge.world.sim_table import GpsOutage, sim_table
 from sim_bridge.world.simulator import PublishRanges, stop_signals
 from sim_bridge.world.truth import TruthError
 from sim_bridge.world.uwb_frames import UwbDrivers
@@ -29,6 +29,7 @@ LOG = logging.getLogger(__name__)
 STEP_S = 0.01
 PROGRESS_S = 5.0
 DAEMONS_WAIT_S = 10.0
+GIVE_BACK_S = 2.0
 
 
 class SimulatorAbsent(OSError):
@@ -72,6 +73,8 @@ class SitlBridge:
         """Raises `ConfigError` for addresses that cannot be used."""
         self._sitl = sitl_table(config)
         self._gps_outages = sim_table(config).gps_outages
+        self._no_answer: set[int] = set()
+        """Whose GPS should be off and is not."""
         self._world = world
         self._publish_ranges = publish_ranges
         self._drivers = UwbDrivers()
@@ -87,14 +90,14 @@ class SitlBridge:
         self._world.tracks[agent_id].put(truth)
 
     def _gps_out(self, agent_id: int) -> bool:
+        return self._is_out(self._gps_outages, agent_id)
+
+    def _is_out(self, outages: tuple[GpsOutage, ...], agent_id: int) -> bool:
         start_s = self._world.start_s
         if start_s is None:
             return False
         flown_s = time.monotonic() - start_s
-        return any(
-            outage.agent == agent_id and outage.from_s <= flown_s < outage.to_s
-            for outage in self._gps_outages
-        )
+        return any(each.agent == agent_id and each.from_s <= flown_s < each.to_s for each in outages)
 
     async def open(self) -> None:
         """Open all links; raises `PortError` or `LinkError`."""
@@ -118,12 +121,34 @@ class SitlBridge:
         while not stop.is_set() and not self._lost:
             await self._step()
             now_s = time.monotonic()
+            self._switch_gps()
             self._range(now_s)
             self._note_silence(now_s)
             if on_step is not None:
                 on_step(self._world, now_s)
         self._end_s = time.monotonic()
+        await self._give_gps_back()
         return self.report()
+
+    async def _give_gps_back(self) -> None:
+        """The simulators outlive the run: what was taken away is put back."""
+        until_s = time.monotonic() + GIVE_BACK_S
+        while any(vehicle.has_gps_off() for vehicle in self.vehicles) and time.monotonic() < until_s:
+            for vehicle in self.vehicles:
+                vehicle.session.gps_off = False
+                vehicle.serve(time.monotonic())
+            await asyncio.sleep(STEP_S)
+
+    def _switch_gps(self) -> None:
+        """Take the autopilots' GPS away, or give it back; say once where that does not work."""
+        for vehicle in self.vehicles:
+            session, agent_id = vehicle.session, vehicle.agent_id
+            session.gps_off = self._is_out(self._sitl.autopilot_gps, agent_id)
+            unknown = session.gps_off and session.receiver is not None and not session.receiver.known
+            if unknown and agent_id not in self._no_answer:
+                assert session.receiver is not None
+                self._no_answer.add(agent_id)
+                LOG.warning("drone %s: its simulator has no %s: its GPS stays on", agent_id, session.receiver.name)
 
     async def _simulators_there(self, stop: asyncio.Event, on_progress: OnProgress) -> None:
         deadline_s = time.monotonic() + self._sitl.appear_timeout_s

@@ -17,7 +17,8 @@ from agent.mavlink.stream_rates import StreamRates
 from agent.mavlink.timesync import BootClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Triple
-from sim_bridge.sitl.sitl_table import COMPONENT_ID
+from sim_bridge.sitl.receiver_switch import ReceiverSwitch
+from sim_bridge.sitl.sitl_table import COMPONENT_ID, sitl_table
 from sim_bridge.sitl.truth import TRUTH_HZ, TRUTH_MESSAGES, TrueSample, TruthTap, boot_time_s
 
 HEARTBEAT_S = 1.0
@@ -48,6 +49,10 @@ class SitlSession:
         self.rates: StreamRates | None = None
         self.flavour: str | None = None
         """``px4`` or ``ardupilot`` once it is found."""
+        self.gps_off = False
+        """Whether its autopilot's GPS is to be off now."""
+        self._switches_gps = any(outage.agent == agent_id for outage in sitl_table(config).autopilot_gps)
+        self.receiver: ReceiverSwitch | None = None
         self.truths = 0
         self.reboots = 0
         self.ignored: Counter[str] = Counter()
@@ -87,6 +92,9 @@ class SitlSession:
         request = self.rates.poll(now_s)
         if request is not None:
             messages.append(self._interval(*request))
+        if self.receiver is not None:
+            switch = self.receiver.due(self.gps_off, self._system, self._component, now_s)
+            messages += [] if switch is None else [switch]
         return [self._encoder.encode(message) for message in messages]
 
     def reconnected(self, now_s: float) -> None:
@@ -106,6 +114,9 @@ class SitlSession:
                 self.clock.on_reply(message.tc1, message.ts1, now_s)
         elif message_id == mavlink.MAVLINK_MSG_ID_COMMAND_ACK:
             self._on_ack(message, now_s)
+        elif message_id == mavlink.MAVLINK_MSG_ID_PARAM_VALUE:
+            if self.receiver is not None:
+                self.receiver.on_value(message)
         else:
             self.rates.on_message(message_id)
             self.tap.on_message(message, now_s)
@@ -131,6 +142,7 @@ class SitlSession:
             }
             self.rates = StreamRates(wanted)
             self.rates.restart(now_s)
+            self.receiver = ReceiverSwitch(flavour) if self._switches_gps else None
 
     def _on_ack(self, message: Message, now_s: float) -> None:
         mine = (self._encoder.system_id, self._encoder.component_id)

@@ -15,6 +15,7 @@ from agent.config.faults import Fault
 from agent.config.fields import AgentId, Positive, Table
 from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
+from sim_bridge.world.sim_table import GpsOutage
 from transport.link.addresses import MAX_PORT
 
 COMPONENT_ID = 194
@@ -46,6 +47,8 @@ class SitlTable(Table, frozen=True):
     """All simulators have to show themselves within this."""
     silence_s: Positive = 5.0
     """A simulator that tells no truth for longer than this ends the run."""
+    autopilot_gps: tuple[GpsOutage, ...] = ()
+    """When the autopilots themselves have no GPS: their simulators take it away (SIM_GPS_USED, SIM_GPS1_ENABLE)."""
     mission: str | None = None
     """File of the mission to fly, relative to the configuration file; absent = the bridge only watches."""
 
@@ -58,6 +61,11 @@ def _faults(table: SitlTable, config: FleetConfig) -> Iterator[Fault]:
         if vehicle.agent in seen:
             yield Fault(key, "one entry per agent", f"a second one of agent {vehicle.agent}")
         seen.add(vehicle.agent)
+    for index, outage in enumerate(table.autopilot_gps):
+        key = f"sitl.autopilot_gps[{index}]"
+        yield from unknown_ids(config, f"{key}.agent", (outage.agent,))
+        if outage.to_s <= outage.from_s:
+            yield Fault(f"{key}.to_s", f"later than from_s = {outage.from_s:g}", f"{outage.to_s:g}")
     last = table.client_port + len(config.ids) - 1
     if last > MAX_PORT:
         yield Fault("sitl.client_port", f"a port for each agent up to {MAX_PORT}", f"{last} for the last")

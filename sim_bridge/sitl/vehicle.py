@@ -94,6 +94,10 @@ class SitlVehicle:
         for frame in self.session.to_send(now_s):
             self._link.send(frame)
 
+    def has_gps_off(self) -> bool:
+        """Whether its autopilot's GPS is switched off by us."""
+        return self.session.receiver is not None and self.session.receiver.is_off
+
     def missing(self) -> str | None:
         """What this simulator still owes, for people; ``None`` once it has told a truth."""
         session = self.session

@@ -79,6 +79,8 @@ class FedVehicle:
     sigma_m: float = 0.2
     noted: list[Noted] = field(default_factory=list)
     sent: list[tuple[float, Message]] = field(default_factory=list)
+    flown: list[tuple[float, bool, FlightMode]] = field(default_factory=list)
+    """At every step of the world: whether the autopilot has a position, and its mode."""
 
     def __post_init__(self) -> None:
         document = {
@@ -134,6 +136,8 @@ class FedVehicle:
             frames = [frame for _, frame in self.simulation.advance(START_S + now_s).frames]
             world = self.simulation.world
             self._truth.append((now_s, world.position_m[0].copy(), world.velocity_mps[0].copy()))
+            state = self.autopilot.state
+            self.flown.append((now_s, state.navigation.aided(START_S + now_s), state.mode))
             if not self.alive(now_s):
                 continue
             self._hear(b"".join(frames), now_s)
@@ -150,6 +154,12 @@ class FedVehicle:
     def errors_m(self, from_s: float, to_s: float) -> Vector:
         """Horizontal errors of the autopilot in an interval."""
         return np.array([np.hypot(*n.error_m[:2]) for n in self.noted if from_s <= n.at_s < to_s])
+
+    def step_m(self, from_s: float, to_s: float) -> float:
+        """Largest horizontal change of the autopilot's error between two estimates of an interval: a step of its own
+        position, since in a tenth of a second it drifts by centimetres."""
+        errors_m = np.array([n.error_m[:2] for n in self.noted if from_s <= n.at_s < to_s])
+        return float(np.hypot(*np.diff(errors_m, axis=0).T).max())
 
     def phases(self, from_s: float, to_s: float) -> set[FeedPhase]:
         """Those of an interval."""
@@ -187,7 +197,8 @@ class FedVehicle:
         state = self.judged(now_s)
         level = ProtectionLevel(3.7 * self.sigma_m, 3.3 * self.sigma_m)
         host_s = START_S + t_s
-        stamp_s = host_s if self.flavour == "px4" else self.session.clock.boot_s(host_s)
+        ahead_s = 0.0 if self.session.reads_stamps else self.age_s
+        stamp_s = host_s + ahead_s if self.flavour == "px4" else self.session.clock.boot_s(host_s)
         ready = Ready(
             t_s,
             now_s,
@@ -198,7 +209,8 @@ class FedVehicle:
             statement(state, level, 0.6),
             self._quaternion,
             None if stamp_s is None or stamp_s < 0 else round(stamp_s * 1e6),
-            now_s - self._fix_s > LOST_AFTER_S,
+            self.session.samples.without_fix or now_s - self._fix_s > LOST_AFTER_S,
+            ahead_s,
         )
         self.feeder.on_life(self._link(), (self.session.reboots, self.session.handovers))
         for message in self.feeder.on_estimate(ready, self._link(), START_S + now_s):

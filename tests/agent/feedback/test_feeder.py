@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,8 @@ class Hover:
         self.link = FedAutopilot(True, flavour, 1, 1)
         self.now_s = 0.0
         self.fix_off_m = 0.0
+        self.off: dict[int, float] = {}
+        """Whose fixes are off, by integrity."""
         self.questions: list[Message] = []
         self.given: list[Message] = []
         self.tell_origin(ORIGIN_M)
@@ -82,7 +85,7 @@ class Hover:
             np.array((*AT_M, 0.0, 0.0, 0.0)),
             np.eye(6) * 0.04,
             Status.OK,
-            statement(state, ProtectionLevel(0.5, 0.8), 0.3),
+            replace(statement(state, ProtectionLevel(0.5, 0.8), 0.3), off=self.off),
             (1.0, 0.0, 0.0, 0.0),
             round(t_s * 1e6) if t_s > 0 else None,
             lost,
@@ -232,6 +235,37 @@ def test_a_gps_that_returns_elsewhere_is_told() -> None:
     [finding] = hover.feeder.findings()
     assert (finding.what, finding.value) == (What.GPS_BACK_WRONG, pytest.approx(300.0, abs=0.1))
     assert hover.feeder.verdict.phase is FeedPhase.FEEDING
+
+
+@pytest.mark.parametrize("told", [False, True])
+def test_a_spoofed_receiver_is_told_to_the_ground_always_and_to_ardupilot_where_asked_for(told: bool) -> None:
+    def commands(hover: Hover) -> list[tuple[float, float]]:
+        asked = [each for each in hover.questions if each.get_type() == "COMMAND_LONG"]
+        return [(each.param1, each.param2) for each in asked if each.command == mavlink.MAV_CMD_USER_1]
+
+    def texts(hover: Hover) -> list[str]:
+        return [str(each.text) for each in hover.questions if each.get_type() == "STATUSTEXT"]
+
+    hover = Hover("ardupilot", tell_spoofing=told)
+    hover.go(5.0)
+    hover.off = {1: 12.0}
+    hover.go(3.0, IntegrityState.DEGRADED)
+
+    assert texts(hover) == ["fleetloc: GPS 12 m off, spoofed or faulty"]
+    assert commands(hover)[:1] == ([(1.0, 0.0)] if told else [])
+    assert hover.feeder.verdict.phase is FeedPhase.READY
+    if told:
+        ack = mavlink.MAVLink_command_ack_message(mavlink.MAV_CMD_USER_1, mavlink.MAV_RESULT_ACCEPTED)
+        hover.feeder.on_message(ack, None, hover.now_s)
+        hover.go(1.0, IntegrityState.DEGRADED)
+        assert hover.feeder.verdict.phase is FeedPhase.FEEDING
+        hover.off = {}
+        hover.go(11.0)
+        assert commands(hover)[-1] == (0.0, 0.0)
+        hover.feeder.on_message(ack, None, hover.now_s)
+        hover.go(3.0)
+        assert hover.feeder.verdict.phase is FeedPhase.READY
+        assert texts(hover)[1:] == ["fleetloc: GPS agrees again"]
 
 
 @pytest.mark.parametrize(

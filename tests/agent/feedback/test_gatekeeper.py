@@ -92,6 +92,34 @@ def test_the_loss_of_gps_begins_the_feed_at_once_with_a_reset(ready: Run) -> Non
     assert ready.go(5.0, gps_lost=True).reset_counter == before + 1
 
 
+def test_the_first_position_that_is_fed_is_the_autopilots_own(ready: Run) -> None:
+    verdict = ready.go(0.1, gps_lost=True)
+    now = offer(ready.t_s)
+    assert now.position_m + verdict.shift_m == pytest.approx(now.own_m)
+
+    assert ready.go(1.0, gps_lost=True).shift_m[2] == pytest.approx(0.0, abs=1e-9)  # 0.3 m at 0.3 m/s
+    assert ready.go(5.0, gps_lost=True).shift_m.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_an_autopilot_that_is_lost_already_is_set_to_the_estimate(ready: Run) -> None:
+    ready.go(5.0, gps_lost=True, bad="ALERT")
+    lost = offer(ready.t_s).own_m + np.array((40.0, 0.0, 0.0))
+
+    verdict = ready.go(TABLE.agree_s + 0.2, gps_lost=True, own_m=lost)
+
+    assert verdict.feed
+    assert verdict.shift_m.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_what_is_sent_in_standby_is_where_the_autopilot_believes_to_be() -> None:
+    run = Run(Gatekeeper(TABLE, standby=True))
+
+    verdict = run.go(4.0)
+
+    assert verdict.feed
+    assert verdict.shift_m == pytest.approx((0.2, 0.1, 0.3))
+
+
 def test_an_autopilot_with_a_switch_of_its_own_is_sent_what_is_ready() -> None:
     run = Run(Gatekeeper(TABLE, standby=True))
 
@@ -196,6 +224,26 @@ def test_a_gps_that_is_back_300_m_off_is_told_and_the_feed_goes_on(feeding: Run)
     assert (verdict.phase, verdict.feed, verdict.gps_off_m) == (FeedPhase.FEEDING, True, 300.0)
 
 
+def test_a_receiver_that_is_off_and_left_out_is_a_lost_one(ready: Run) -> None:
+    pulled = np.array((4.0, 0.0, 0.0))
+    for _ in range(10):  # the spoofer has pulled the autopilot away before anybody knows
+        ready.t_s += PERIOD_S
+        ready.gate.judge(offer(ready.t_s, own_m=offer(ready.t_s).own_m + pulled))
+    assert ready.gate.phase is FeedPhase.CHECKING
+
+    known = ready.go(1.0, own_m=pulled, gps_off=True, fix_off_m=6.0)
+    assert (known.phase, known.feed) == (FeedPhase.READY, False)
+    left_out = ready.go(1.0, own_m=pulled, gps_off=True, gps_unused=True, fix_off_m=6.0)
+    assert (left_out.phase, left_out.feed, left_out.gps_off_m) == (FeedPhase.FEEDING, True, 6.0)
+    assert ready.go(TABLE.agree_s + 0.2).phase is FeedPhase.READY
+
+
+def test_one_that_was_never_checked_is_not_ready_because_its_receiver_is_off() -> None:
+    run = Run()
+
+    assert run.go(10.0, gps_off=True, gps_unused=True).phase is not FeedPhase.FEEDING
+
+
 def test_steps_beyond_the_limit_are_announced(feeding: Run) -> None:
     before = feeding.gate.resets
 
@@ -244,7 +292,7 @@ def test_whatever_comes_no_step_is_silent_and_nothing_bad_is_fed(
         if verdict.feed:
             assert lost or run.gate.phase is FeedPhase.FEEDING
             assert (bad, level_m <= TABLE.max_horizontal_m) == ("", True)
-            fed.append((run.t_s, verdict.reset_counter, shift))
+            fed.append((run.t_s, verdict.reset_counter, shift + verdict.shift_m))
     for (t0, counter0, shift0), (t1, counter1, shift1) in pairwise(fed):
         if t1 - t0 < 1.0 and counter0 == counter1:
             assert np.linalg.norm(shift1 - shift0) <= TABLE.max_step_m + 1e-9

@@ -335,6 +335,22 @@ def test_the_second_receiver_serves_while_the_first_has_no_fix() -> None:
     assert convert(made, gps2(time_usec=99_970_000)) is None
 
 
+def test_there_is_no_fix_when_all_receivers_that_spoke_say_so() -> None:
+    made = adapter()
+    assert not made.without_fix
+
+    convert(made, gps())
+    assert not made.without_fix
+    convert(made, gps(fix_type=1))
+    assert made.without_fix
+    convert(made, gps2())
+    assert not made.without_fix
+    convert(made, gps2(fix_type=0))
+    assert made.without_fix
+    made.reset()
+    assert not made.without_fix
+
+
 def test_the_second_receiver_serves_once_the_first_was_silent_for_long() -> None:
     made = adapter()
     served = [

@@ -37,9 +37,15 @@ def fleet(**tables: Any) -> FleetConfig:
 
 
 def heard(
-    config: FleetConfig, flavour: FlavourName, seconds: float = 12.0, *, system_id: int = 1, garble: bool = False
+    config: FleetConfig,
+    flavour: FlavourName,
+    seconds: float = 12.0,
+    *,
+    system_id: int = 1,
+    garble: bool = False,
+    lacking: bytes | None = None,
 ) -> Listened:
-    """A simulated autopilot listened to in virtual time."""
+    """A simulated autopilot listened to in virtual time; ``lacking``: a parameter that its firmware does not have."""
     vehicle = Vehicle(1, flavour, system_id, start_m=(0.0, 0.0, -5.0), start_velocity_mps=(0.0, 0.0, 0.0))
     simulation = Simulation(Scenario(vehicles=(vehicle,), frame=FleetFrame.of(config)), START_S)
     onboard = onboard_of(config, linked=True, fleet_offset_s=0.0)
@@ -48,6 +54,8 @@ def heard(
     def take(frames: list[bytes], now_s: float) -> None:
         nonlocal read
         for frame in frames:
+            if lacking is not None and lacking in frame:
+                continue
             data = bytes(each ^ 0x5A for each in frame) if garble else frame
             read += len(data)
             onboard.on_mavlink(data, now_s)
@@ -87,9 +95,12 @@ def test_without_feedback_no_parameter_is_asked_for() -> None:
 
 
 def test_a_parameter_that_is_wrong_is_told_with_what_to_do() -> None:
-    config = fleet(feedback={"kind": "gps_input"})  # the simulated ArduPilot has no second receiver
+    config = fleet(feedback={"kind": "gps_input", "gps_id": 0})
     lines = by_name(of_autopilot(config, 1, heard(config, "ardupilot", 12.0)))
+    assert str(lines["GPS1_TYPE"]).startswith("WRONG GPS1_TYPE: 1; set it to 14 (MAVLink)")
 
+    config = fleet(feedback={"kind": "gps_input"})
+    lines = by_name(of_autopilot(config, 1, heard(config, "ardupilot", 12.0, lacking=b"GPS2_TYPE")))
     assert str(lines["GPS2_TYPE"]).startswith("warn  GPS2_TYPE: not told; this firmware has none")
     wrong = by_name(of_autopilot(fleet(feedback={"kind": "gps_input"}), 1, heard(config, "px4", 3.0)))
     assert str(wrong["feedback.kind"]).startswith('WRONG feedback.kind: "gps_input" is not read by px4')

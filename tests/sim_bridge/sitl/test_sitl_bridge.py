@@ -219,6 +219,24 @@ async def test_ranges_truth_and_a_dropped_gps(tmp_path: Path) -> None:
     assert [step.ready for step in progress] == [False, True, True]
 
 
+async def test_an_autopilot_without_gps_gets_it_back_at_the_end() -> None:
+    # GIVEN a run in which the GPS of drone 1's autopilot is away from the begin
+    config = bridge_config((1,), sitl={"autopilot_gps": [{"agent": 1, "from_s": 0.0, "to_s": 1000.0}]})
+    links = vehicle_links(config)
+    async with simulators_of(config) as sitl:
+        daemon = await Daemon.at(links[1].daemon.port)
+        async with running(config) as (task, stop):
+            await asyncio.wait_for(daemon.heard.wait(), WAIT_S)
+            daemon.say(heartbeat())
+            parameters = sitl.simulation.autopilots[1].state.parameters
+            await until(lambda: parameters.value("SIM_GPS_USED") == 0.0)
+            # WHEN the run ends THEN the simulator is as it was
+            stop.set()
+            await asyncio.wait_for(task, WAIT_S)
+            assert parameters.value("SIM_GPS_USED") == 10.0
+        daemon.transport.close()
+
+
 def request(agent: int, message_id: int, rate_hz: float) -> Any:
     return mavlink.MAVLink_command_long_message(agent, 1, 511, 0, float(message_id), 1e6 / rate_hz, 0, 0, 0, 0, 0)
 

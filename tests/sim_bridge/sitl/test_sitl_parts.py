@@ -22,7 +22,7 @@ from sim_bridge.sitl.mission import MissionError, load_mission
 from sim_bridge.sitl.ports import packed
 from sim_bridge.sitl.session import SitlSession, TimedTruth
 from sim_bridge.sitl.setup import vehicle_links
-from sim_bridge.sitl.sitl_table import COMPONENT_ID
+from sim_bridge.sitl.sitl_table import COMPONENT_ID, sitl_table
 from sim_bridge.sitl.truth import TruthTap
 from sim_bridge.world.simulation import Simulation
 from tests.support.loopback_sitl import FRAME, grounded_fleet
@@ -186,6 +186,37 @@ def test_it_asks_each_autopilot_for_the_message_that_it_has(agent: int) -> None:
     np.testing.assert_allclose(truths[-1].position_m, {1: (0, 0, 0), 2: (0, 12, 0)}[agent], atol=0.02)
 
 
+@pytest.mark.parametrize(("agent", "parameter", "there"), [(1, "SIM_GPS_USED", 10.0), (2, "SIM_GPS1_ENABLE", 1.0)])
+def test_it_takes_gps_away_and_puts_back_what_was_there(agent: int, parameter: str, there: float) -> None:
+    outages = [{"agent": agent, "from_s": 1.0, "to_s": 2.0}]
+    session, simulation, _ = converse(agent, 3.0, sitl={"autopilot_gps": outages})
+    autopilot = simulation.autopilots[agent]
+
+    def told(off: bool) -> float:
+        session.gps_off = off
+        for _ in range(400):
+            now = simulation.next_step_s()
+            session.receive(b"".join(frame for _, frame in simulation.advance(now).frames), now)
+            for frame in session.to_send(now):
+                session.receive(b"".join(simulation.receive(agent, frame, now)), now)
+        assert session.receiver is not None
+        assert session.receiver.is_off is off
+        return autopilot.state.parameters.value(parameter)
+
+    assert autopilot.state.parameters.value(parameter) == there
+    assert told(True) == 0.0
+    assert not autopilot.state.navigation.aided(simulation.now)
+    assert told(False) == there
+    assert autopilot.state.navigation.aided(simulation.now)
+
+
+def test_it_leaves_parameters_alone_that_nobody_spoke_of() -> None:
+    session, simulation, _ = converse(1, 3.0)
+
+    assert session.receiver is None
+    assert simulation.autopilots[1].counters.ignored["unknown parameter"] == 0
+
+
 def test_answers_to_the_daemon_are_not_taken_for_answers_to_the_bridge() -> None:
     config = fleet_config(ids=(2,))
     session = SitlSession(config, 2, datagrams=True)
@@ -298,6 +329,13 @@ def test_gps_drops_become_outages() -> None:
     ):  # fmt: skip
         with pytest.raises(error):
             gps_outage(text, (1, 2), duration_s)
+
+
+def test_the_option_is_named_that_is_wrong() -> None:
+    with pytest.raises(InputError, match="--autopilot-gps: expected one of the ids 1, 2, found 3"):
+        gps_outage("3:1,2", (1, 2), None, "--autopilot-gps")
+    with pytest.raises(ConfigError, match="autopilot_gps"):
+        sitl_table(fleet_config(sitl={"autopilot_gps": [{"agent": 1, "from_s": 3.0, "to_s": 2.0}]}))
 
 
 def test_the_frame_is_that_of_the_fleet() -> None:

@@ -43,6 +43,60 @@ def test_it_flies_on_without_gps_and_hands_back(flavour: Any) -> None:
 
 
 @FLAVOURS
+def test_the_hand_over_is_no_step(flavour: Any) -> None:
+    flight = FedVehicle(flavour, outage_s=(LOST_S, BACK_S)).fly(40.0)
+
+    assert flight.step_m(LOST_S, LOST_S + 4.0) < 0.3
+    assert flight.step_m(BACK_S, BACK_S + 9.0) < 0.3
+
+
+@pytest.mark.parametrize(
+    ("flavour", "kind", "message", "parameters"),
+    [
+        ("px4", "global", "GLOBAL_POSITION_SENSOR", {"EKF2_AGP0_NOISE": 0.3}),
+        ("ardupilot", "gps_input", "GPS_INPUT", {}),
+    ],
+)
+def test_it_flies_on_as_a_position_sensor_or_as_a_receiver_too(
+    flavour: Any, kind: str, message: str, parameters: dict[str, float]
+) -> None:
+    outage_s = (LOST_S, 60.0)
+    flight = FedVehicle(flavour, outage_s=outage_s, feedback={"kind": kind}, parameters=parameters).fly(70.0)
+
+    assert flight.phases(LOST_S + 1.0, 60.0) == {FeedPhase.FEEDING}
+    assert {n.mode for n in flight.noted} == {FlightMode.MISSION}
+    assert message in {each.get_type() for _, each in flight.sent}
+    errors_m = flight.errors_m(LOST_S + 2.0, 60.0)
+    assert np.sqrt(np.mean(errors_m**2)) < 0.6
+    assert errors_m.max() < 1.5
+    assert flight.step_m(LOST_S, LOST_S + 4.0) < 0.3
+    assert flight.autopilot.state.global_feed.rejected == {}
+    assert flight.first_said("NOT_FUSED") == np.inf
+    assert flight.noted[-1].phase is FeedPhase.READY
+
+
+@pytest.mark.parametrize(
+    ("settings", "said"),
+    [
+        ({"feedback": {"kind": "global"}, "parameters": {"EKF2_AGP0_ID": 3.0}}, "parameter EKF2_AGP0_ID is 3"),
+        ({"feedback": {"kind": "global"}, "parameters": {"EKF2_AGP0_CTRL": 0.0}}, "parameter EKF2_AGP0_CTRL is 0"),
+        (
+            {"flavour": "ardupilot", "feedback": {"kind": "gps_input"}, "parameters": {"GPS2_TYPE": 1.0}},
+            "parameter GPS2_TYPE is 1",
+        ),
+        (
+            {"flavour": "ardupilot", "feedback": {"kind": "gps_input"}, "parameters": {"GPS_AUTO_SWITCH": 0.0}},
+            "parameter GPS_AUTO_SWITCH is 0",
+        ),
+    ],
+)
+def test_what_these_kinds_need_is_said_before_the_loss(settings: dict[str, Any], said: str) -> None:
+    flight = FedVehicle(**settings).fly(8.0)
+
+    assert flight.first_said(f"NOT_FUSED {said}") < 8.0
+
+
+@FLAVOURS
 def test_an_alarm_withholds_and_the_autopilot_lands_as_without_us(flavour: Any) -> None:
     def judged(at_s: float) -> IntegrityState:
         return IntegrityState.ALERT if at_s > 18.0 else IntegrityState.NOMINAL
@@ -155,10 +209,10 @@ def test_why_it_is_not_used_is_said_by_name(settings: dict[str, Any], said: str,
 
 
 def test_estimates_that_are_too_old_for_px4_are_said_to_be() -> None:
-    # until its clock filter has converged, after 50 s, it takes every message for one of now
-    flight = FedVehicle(outage_s=(56.0, 90.0), parameters={"EKF2_DELAY_MAX": 100.0}).fly(60.0)
+    # until its clock filter has converged, for which it has a minute, it is told where the drone is now
+    flight = FedVehicle(outage_s=(64.0, 90.0), parameters={"EKF2_DELAY_MAX": 100.0}).fly(67.5)
 
-    assert flight.first_said("NOT_FUSED delay: estimates are 0.15 s old, EKF2_DELAY_MAX is 100") < 56.0 + 3.2
+    assert flight.first_said("NOT_FUSED delay: estimates are 0.15 s old, EKF2_DELAY_MAX is 100") < 64.0 + 3.2
 
 
 def test_a_link_that_ends_stops_the_feed_and_its_return_is_checked_anew() -> None:

@@ -1,0 +1,48 @@
+"""How a feed begins without a step: the first position that is fed is the autopilot's own.
+
+Its receiver and the fleet are never quite of one opinion, and without fixes it drifts until the loss is noticed. An
+autopilot that begins to use positions from outside is set to the first of them (PX4 when nothing else aids it,
+ArduPilot at the change of the source set), so that the difference would be a step in flight. It is taken off slowly.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from estimators.model.measurements import Vector
+
+RATE_MPS = 0.3
+"""So fast is a difference taken off, horizontally and vertically."""
+LARGEST_HORIZONTAL_M, LARGEST_VERTICAL_M = 1.5, 5.0
+"""A larger difference is an autopilot that is lost already: it is set to the estimate at once."""
+
+
+class Handover:
+    """Of one feed: ``shift_m`` ``(3,)`` NED is added to the estimate."""
+
+    def __init__(self) -> None:
+        self.shift_m: Vector = np.zeros(3)
+        self._at_s = -math.inf
+
+    def begin(self, apart_m: Vector | None, t_s: float) -> None:
+        """The feed begins, or is only prepared, with an estimate of ``t_s`` that is ``apart_m`` ``(3,)`` from the
+        autopilot's own position; ``None`` if that is not known."""
+        self._at_s = t_s
+        self.shift_m = np.zeros(3)
+        if apart_m is None or not np.isfinite(apart_m).all():
+            return
+        if math.hypot(apart_m[0], apart_m[1]) <= LARGEST_HORIZONTAL_M and abs(apart_m[2]) <= LARGEST_VERTICAL_M:
+            self.shift_m = -np.asarray(apart_m, float)
+
+    def go_on(self, t_s: float) -> Vector:
+        """Take some of it off; by how much the shift changed, ``(3,)``."""
+        most_m = RATE_MPS * max(t_s - self._at_s, 0.0)
+        self._at_s = t_s
+        before_m = self.shift_m
+        across_m = math.hypot(before_m[0], before_m[1])
+        sizes_m = np.array((across_m, across_m, abs(before_m[2])))
+        left_m = np.maximum(sizes_m - most_m, 0.0)
+        self.shift_m = before_m * np.divide(left_m, sizes_m, out=np.zeros(3), where=sizes_m > 0.0)
+        return np.asarray(self.shift_m - before_m)

@@ -16,6 +16,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from estimators.compiled.entries import entry, kernel
+from estimators.compiled.linear_algebra import cholesky_upper, solve_upper_transposed
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import IntArray
@@ -152,26 +154,55 @@ def reduce(mixture: Mixture) -> None:
     """Normalise, give up unlikely components, merge those that say the same (moments are kept)."""
     order = np.argsort(-mixture.log_weights, kind="stable")[:MOST]
     order = order[mixture.log_weights[order] > mixture.log_weights[order[0]] - PRUNED_NATS]
-    weights, means = mixture.weights[order], mixture.means[order]
-    covariances = mixture.covariances[order]
-    left = np.ones(len(order), bool)
-    merged: list[tuple[float, Vector, Matrix]] = []
-    for k in range(len(order)):
-        if not left[k]:
+    weights, means, covariances = mixture.weights[order], mixture.means[order], mixture.covariances[order]
+    left = _merge(weights, means, covariances)
+    mixture.log_weights = np.log(weights[:left] / weights[:left].sum())
+    mixture.means, mixture.covariances = means[:left], covariances[:left]
+
+
+@entry("int64(float64[::1], float64[:, ::1], float64[:, :, ::1])")
+def _merge(weights: Vector, means: Matrix, covariances: Matrix) -> int:
+    """Replace components, the likeliest first, by what is left of them when each has taken in those near to it.
+
+    Gives how many are left, which stand in front.
+    """
+    count, size = means.shape
+    open_, near, away, kept = np.ones(count, np.bool_), np.empty(count, np.int64), np.empty(size), 0
+    for k in range(count):
+        if not open_[k]:
             continue
-        away = means - means[k]
-        near = left & (np.einsum("ki,ki->k", away, np.linalg.solve(covariances[k], away.T).T) < MERGED_SQUARE)
-        near[k] = True
-        left &= ~near
-        share = weights[near] / weights[near].sum()
-        mean = share @ means[near]
-        off = means[near] - mean
-        spread = np.einsum("k,kij->ij", share, covariances[near] + off[:, :, None] * off[:, None, :])
-        merged.append((float(weights[near].sum()), mean, spread))
-    total = sum(weight for weight, _, _ in merged)
-    mixture.log_weights = np.log([weight / total for weight, _, _ in merged])
-    mixture.means = np.array([mean for _, mean, _ in merged])
-    mixture.covariances = np.array([spread for _, _, spread in merged])
+        factor = covariances[k].copy()
+        definite, found = cholesky_upper(factor), 0
+        for j in range(k, count):
+            if not open_[j]:
+                continue
+            if j > k:
+                away[:] = means[j] - means[k]
+                solve_upper_transposed(factor, away)
+                if not (definite and np.dot(away, away) < MERGED_SQUARE):
+                    continue
+            near[found], open_[j] = j, False
+            found += 1
+        weights[kept] = _moments(weights, means, covariances, near[:found], means[kept], covariances[kept])
+        kept += 1
+    return kept
+
+
+@kernel
+def _moments(
+    weights: Vector, means: Matrix, covariances: Matrix, near: IntArray, mean: Vector, covariance: Matrix
+) -> float:
+    """mean, covariance <- those of the components ``near`` together; gives their weight."""
+    total, centre, spread = 0.0, np.zeros(len(mean)), np.zeros(covariance.shape)
+    for j in near:
+        total += weights[j]
+    for j in near:
+        centre += weights[j] / total * means[j]
+    for j in near:
+        away = means[j] - centre
+        spread += weights[j] / total * (covariances[j] + np.outer(away, away))
+    mean[:], covariance[:, :] = centre, spread
+    return total
 
 
 def on_sphere(

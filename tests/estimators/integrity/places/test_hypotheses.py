@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from estimators.integrity.places.hypotheses import (
+    MERGED_SQUARE,
     MOST,
     Drift,
     Mixture,
@@ -53,6 +54,34 @@ def test_splitting_and_merging_keep_the_moments(seed: int) -> None:
     if not pruned:
         for now, then in zip(moments(mixture), before, strict=True):
             assert now == pytest.approx(then, abs=1e-6)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.sampled_from([6, 9]))
+def test_the_likeliest_takes_in_who_is_near_it_then_the_next_one_that_is_left(seed: int, states: int) -> None:
+    # GIVEN components about a few places; the definition says which of them belong together
+    rng = np.random.default_rng(seed)
+    count = int(rng.integers(2, 20))
+    spots = rng.normal(size=(4, states)) * 2.0
+    means = spots[rng.integers(0, 4, count)] + rng.normal(size=(count, states)) * 0.3
+    covariances = np.array([random_covariance(rng, states, 1.0) for _ in range(count)])
+    mixture = Mixture(rng.normal(size=count), means, covariances)
+    left, wanted = np.argsort(-mixture.log_weights).tolist(), []
+    while left:
+        inverse = np.linalg.inv(covariances[left[0]])
+        square = [float((means[j] - means[left[0]]) @ inverse @ (means[j] - means[left[0]])) for j in left]
+        group = [j for j, each in zip(left, square, strict=True) if each < MERGED_SQUARE]
+        alone = Mixture(mixture.log_weights[group], means[group], covariances[group])
+        wanted.append((mixture.weights[group].sum(), *moments(alone)))
+        left = [j for j in left if j not in group]
+    # WHEN they are merged
+    reduce(mixture)
+    # THEN so they are
+    assert len(mixture.log_weights) == len(wanted)
+    for k, (weight, mean, spread) in enumerate(wanted):
+        assert mixture.weights[k] == pytest.approx(weight)
+        np.testing.assert_allclose(mixture.means[k], mean, atol=1e-9)
+        np.testing.assert_allclose(mixture.covariances[k], spread, atol=1e-9)
 
 
 def test_one_component_is_a_kalman_filter() -> None:

@@ -25,6 +25,7 @@ from agent.log.run_logs import RunLogs
 from agent.mavlink.link import create_link
 from agent.mavlink.session import LinkState
 from agent.mavlink.signing_stamps import StampKeeper
+from agent.mavlink.slow_streams import SlowStreamLog
 from agent.onboard import OnboardAgent
 from agent.outputs import (
     ClockStepped,
@@ -183,6 +184,7 @@ class Daemon:
         self._left_out = 0
         self._next_fault_line_s = 0.0
         self._link_watch = LinkWatch(time.monotonic())
+        self._slow_streams = SlowStreamLog()
         self._stop = asyncio.Event()
         self._failure: AgentError | None = None
 
@@ -288,7 +290,9 @@ class Daemon:
             self.stop()
 
     def _searched_in_vain(self, limit_s: float) -> str:
-        seen = ", ".join(self.onboard.autopilot.ignored) or "nothing"
+        autopilot = self.onboard.autopilot
+        systems = [f"system {each}" for each in sorted(autopilot.other_systems)]
+        seen = ", ".join([*systems, *autopilot.ignored]) or "nothing"
         system = self._config.system_id(self._agent_id)
         flavour = self._config.agent(self._agent_id).autopilot
         return (
@@ -411,10 +415,16 @@ class Daemon:
                 self.onboard.hold(self._found())
                 self._carry_out(self.onboard.keep_house(unix_s=time.time(), host_s=time.monotonic()))
                 self._advance()
+            with self._faults.survived("looking at the streams"):
+                self._tell_slow_streams()
             with self._faults.survived("telling the state"):
                 self._tell_state()
             with self._faults.survived("asking for clocks"):
                 await self.radio.ask_clocks()
+
+    def _tell_slow_streams(self) -> None:
+        for line in self._slow_streams.lines(self.onboard.autopilot.slow_streams(), time.monotonic()):
+            LOG.warning("agent %d: %s", self._agent_id, line)
 
     def _found(self) -> tuple[Finding, ...]:
         """What is wrong with the daemon itself."""

@@ -25,6 +25,7 @@ from agent.inputs import Due, Gone, HouseKept, Input, Journal, MavlinkIn, Packet
 from agent.mavlink.codec import mavlink
 from agent.mavlink.session import AutopilotSession, LinkState
 from agent.mavlink.signing import LinkSigning
+from agent.mavlink.slow_streams import slow_findings
 from agent.outputs import (
     ClockStepped,
     CoreOutput,
@@ -120,7 +121,7 @@ class OnboardAgent:
             agreement=None if recorded else agreement_hash(shared),
             recorded=recorded,
         )
-        self.agreement = AgreementWatch(shared, self.opener.peers)
+        self.agreement = AgreementWatch(shared, self.opener.peers, agent_id)
         self.sealer = Sealer(
             config.fleet.name,
             agent_id,
@@ -162,6 +163,11 @@ class OnboardAgent:
     def link_state(self) -> LinkState:
         """How the autopilot's link is; without one, samples are connected by definition."""
         return self.autopilot.state if self._linked else LinkState.CONNECTED
+
+    @property
+    def link_told(self) -> str:
+        """The same in words."""
+        return self.autopilot.told if self._linked else str(LinkState.CONNECTED)
 
     # --- what comes in --------------------------------------------------------------------------------------
 
@@ -208,7 +214,7 @@ class OnboardAgent:
         if isinstance(received.message, ClockAnswer):
             self.opener.peers[received.sender].clock.add(received.message, unix_ns)
         elif isinstance(received.message, Agreement):
-            self.agreement.on_told(received.sender, received.message)
+            self.agreement.on_told(received.sender, received.message, host_s)
             self._look_around(host_s)
         else:
             self.core.on_packet(received, self.fleet_s(host_s))
@@ -243,8 +249,9 @@ class OnboardAgent:
             self._cores += 1
         self._look_around(host_s)
         outputs: list[Output] = [ClockStepped()] if stepped else []
-        if self.agreement.is_contradicted(host_s):
-            outputs += self._sealed(self.agreement.own, self._unix_ns(host_s))
+        told = self.agreement.to_tell(host_s)
+        if told is not None:
+            outputs += self._sealed(told, self._unix_ns(host_s))
         return outputs
 
     def hold(self, findings: tuple[Finding, ...]) -> None:
@@ -306,7 +313,7 @@ class OnboardAgent:
         """What is due in the core; its messages are sealed."""
         self._note(Due(host_s), host_s)
         outputs: list[Output] = []
-        for output in self.core.advance(self.fleet_s(host_s), str(self.link_state)):
+        for output in self.core.advance(self.fleet_s(host_s), self.link_told):
             outputs += self._put_out(output, host_s)
         return outputs
 
@@ -386,7 +393,8 @@ class OnboardAgent:
         """Say in the health why we reach nobody, as the tick fits no packet, or why others do not reach us."""
         fault = clock_fault(self._config.fleet, self.unix_s(host_s)) or step_fault(self.clock)
         fed = () if self.feeder is None else self.feeder.findings()
-        held = (*clock_finding(fault), *self.agreement.observe(host_s), *fed, *self._told_by_shell)
+        slow = slow_findings(self.autopilot.slow_streams())
+        held = (*clock_finding(fault), *self.agreement.observe(host_s), *fed, *self._told_by_shell, *slow)
         self.core.health.hold(held)
 
     def _new_core(self, first_tick: int | None = None) -> AgentCore:

@@ -17,6 +17,7 @@ Message = Any
 """A pymavlink message of the dialect; pymavlink has no useful common type."""
 
 _KEEP_BYTES = 4096
+_NEAR = 16
 
 
 class Decoder:
@@ -35,7 +36,7 @@ class Decoder:
         self.received = 0
         """Good messages."""
         self.lost = 0
-        """Messages missing by gaps in the senders' sequence numbers."""
+        """Messages missing by gaps in the senders' sequence numbers; those of unknown ids are not missing."""
         self.bad: Counter[str] = Counter()
         """Frames and stretches of bytes refused, by reason."""
         self.frames: tuple[bytes, ...] = ()
@@ -49,6 +50,7 @@ class Decoder:
                 self.bad[_reason(message.reason)] += 1
             elif isinstance(message, mavlink.MAVLink_unknown):
                 self.bad["unknown message"] += 1  # its checksum could not be verified either
+                self._pass(message)
             elif self.signing is not None and not self.signing.accepts(bytes(message.get_msgbuf())):
                 self.bad["not authentic"] += 1  # why is counted by `signing`
             else:
@@ -67,6 +69,15 @@ class Decoder:
             self.lost += gap
         self._sequence[source] = message.get_seq()
 
+    def _pass(self, message: Message) -> None:
+        """Take an unknown message's number for sent, if it is near the last one: nobody vouches for its frame."""
+        source, number = _header(bytes(message.get_msgbuf()))
+        last = self._sequence.get(source)
+        gap = _NEAR if last is None else (number - last - 1) % 256
+        if gap < _NEAR:
+            self.lost += gap
+            self._sequence[source] = number
+
     def _trim(self) -> None:
         """Bound the parser's buffer, which pymavlink frees only when a read ends on a frame's end."""
         if self._datagrams and self._parser.buf_len():
@@ -75,6 +86,12 @@ class Decoder:
         elif self._parser.buf_index > _KEEP_BYTES:
             self._parser.buf = self._parser.buf[self._parser.buf_index :]
             self._parser.buf_index = 0
+
+
+def _header(frame: bytes) -> tuple[tuple[int, int], int]:
+    """(system, component) and sequence number of a frame, of either version of MAVLink."""
+    at = 4 if frame[0] == mavlink.PROTOCOL_MARKER_V2 else 2
+    return (frame[at + 1], frame[at + 2]), frame[at]
 
 
 def _parser() -> Any:

@@ -24,13 +24,15 @@ from agent.mavlink.components import (
 )
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.mavlink.signing import LinkSigning
-from agent.mavlink.stream_rates import StreamRates
+from agent.mavlink.stream_rates import StreamRates, StreamState
 from agent.mavlink.timesync import BootClock
 from agent.sensing.clock import FleetClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Sample
 
 HEARTBEAT_PERIOD_S = 1.0
+MOST_NAMED = 8
+"""Other systems that are remembered by their id."""
 REBOOT_BACKWARDS_S = 1.0
 REBOOT_CONFIRM = 3
 """So many stamps in a row that agree are of a new clock; a single one that is behind is not."""
@@ -119,6 +121,8 @@ class AutopilotSession:
         self.handovers = 0
         """How often another component was taken for the autopilot than before."""
         self.ignored: Counter[str] = Counter()
+        self.other_systems: set[int] = set()
+        """Systems that say they are vehicles and are not ours, the first few."""
         self._last_heartbeat_s = 0.0
         self._next_heartbeat_s = 0.0
         self._taken_s = 0.0
@@ -138,6 +142,18 @@ class AutopilotSession:
     def sent(self) -> int:
         """Messages encoded for the autopilot."""
         return self._encoder.sent
+
+    @property
+    def told(self) -> str:
+        """The link's state, and who is there in place of the autopilot that is looked for."""
+        if self.state is not LinkState.SEARCHING or not self.other_systems:
+            return str(self.state)
+        others = ", ".join(map(str, sorted(self.other_systems)))
+        return f"{self.state}: expected system {self._expected_system}, heard {others}"
+
+    def slow_streams(self) -> list[StreamState]:
+        """Those that come more slowly than asked for, from an autopilot that is there."""
+        return self.rates.slow() if self.state is LinkState.CONNECTED else []
 
     def receive(self, data: bytes, now_s: float) -> list[Sample]:
         """Take in bytes of the link; the samples they hold. Answers are fetched by `to_send`."""
@@ -222,6 +238,8 @@ class AutopilotSession:
         flavour = FLAVOURS.get(message.autopilot, "other")
         if message.get_srcSystem() != self._expected_system:
             self.ignored["heartbeat: other system"] += 1
+            if len(self.other_systems) < MOST_NAMED:
+                self.other_systems.add(message.get_srcSystem())
             return
         if self._expected_flavour not in ("auto", flavour):
             self.ignored[f"heartbeat: {flavour} instead of {self._expected_flavour}"] += 1

@@ -5,6 +5,7 @@ COMMAND_ACK does not say which message an interval was for, so only one request 
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 from agent.mavlink.codec import mavlink
@@ -16,6 +17,8 @@ RATE_FLOOR = 0.6
 """A stream below this share of its wanted rate is asked for again: autopilots round rates to their loop's."""
 REPEAT_S = 30.0
 """Another client may fight for the rates; ask again no more often than this."""
+REPEAT_SILENT_S = (2.0, 4.0, 8.0)
+"""One of which nothing comes is asked for again sooner at first: an autopilot that boots accepts what it forgets."""
 
 
 @dataclass(slots=True)
@@ -31,6 +34,20 @@ class StreamState:
     rate_hz: float | None = None
     counted: int = 0
     count_from_s: float = field(default=0.0)
+    silent: bool = True
+    """Whether nothing has come since it was asked for, or for as long as rates are measured."""
+    repeats: int = 0
+    """How often it was asked for again because it was silent."""
+
+    @property
+    def refused(self) -> bool:
+        """Whether the autopilot answered that it does not send this message."""
+        return self.result not in (None, mavlink.MAV_RESULT_ACCEPTED)
+
+    @property
+    def slow(self) -> bool:
+        """Whether it comes at less than the accepted share of its rate."""
+        return self.rate_hz is not None and self.rate_hz < RATE_FLOOR * self.wanted_hz
 
 
 class StreamRates:
@@ -52,12 +69,14 @@ class StreamRates:
         for stream in self.streams.values():
             stream.attempts, stream.settled_s, stream.result = 0, None, None
             stream.rate_hz, stream.counted, stream.count_from_s = None, 0, now_s
+            stream.silent, stream.repeats = True, 0
 
     def on_message(self, message_id: int) -> None:
         """Count an arrival."""
         stream = self.streams.get(message_id)
         if stream is not None:
             stream.counted += 1
+            stream.silent, stream.repeats = False, 0
 
     def on_ack(self, result: int, now_s: float) -> None:
         """Take the answer to the open request."""
@@ -75,9 +94,12 @@ class StreamRates:
                 self._open.result = None
                 self._settle(self._open, now_s)
         if self._open is None:
-            self._open = next((s for s in self.streams.values() if self._is_due(s, now_s)), None)
-            if self._open is None:
+            due = [stream for stream in self.streams.values() if self._is_due(stream, now_s)]
+            if not due:
                 return None
+            # who has waited longest, those first that were never asked for: a silent one may not hold up the others
+            self._open = min(due, key=lambda each: -math.inf if each.settled_s is None else each.settled_s)
+            self._open.repeats += self._open.settled_s is not None and self._open.silent
             self._open.attempts = 0
         self._open.attempts += 1
         self._sent_s = now_s
@@ -86,24 +108,29 @@ class StreamRates:
     def refused(self, message_id: int) -> bool:
         """Whether the autopilot answered that it does not send this message."""
         stream = self.streams.get(message_id)
-        return stream is not None and stream.result not in (None, mavlink.MAV_RESULT_ACCEPTED)
+        return stream is not None and stream.refused
 
-    def slow(self) -> list[int]:
-        """Ids of messages that come at less than the accepted share of their rate."""
-        return [s.message_id for s in self.streams.values() if self._is_slow(s)]
+    def slow(self) -> list[StreamState]:
+        """Streams that the autopilot sends at less than the accepted share of their rate, or not at all.
+
+        Those that it refuses are not among them: something else was asked for in their place.
+        """
+        return [stream for stream in self.streams.values() if stream.slow and not stream.refused]
 
     def _settle(self, stream: StreamState, now_s: float) -> None:
         stream.settled_s = now_s
         stream.counted, stream.count_from_s, stream.rate_hz = 0, now_s, None
+        stream.silent = True
         self._open = None
 
     def _is_due(self, stream: StreamState, now_s: float) -> bool:
         if stream.settled_s is None:
             return True
-        return now_s - stream.settled_s >= REPEAT_S and self._is_slow(stream)
-
-    def _is_slow(self, stream: StreamState) -> bool:
-        return stream.rate_hz is not None and stream.rate_hz < RATE_FLOOR * stream.wanted_hz
+        early = stream.silent and not stream.refused and stream.repeats < len(REPEAT_SILENT_S)
+        if early:
+            # a slow stream has not had the time to come yet
+            return now_s - stream.settled_s >= max(REPEAT_SILENT_S[stream.repeats], 2 / stream.wanted_hz)
+        return stream.slow and now_s - stream.settled_s >= REPEAT_S
 
     def _measure(self, now_s: float) -> None:
         for stream in self.streams.values():
@@ -111,4 +138,5 @@ class StreamRates:
             # Streams of 1 Hz and less need longer for a count that means anything.
             if elapsed_s >= max(MEASURE_S, 4 / stream.wanted_hz):
                 stream.rate_hz = stream.counted / elapsed_s
+                stream.silent = stream.counted == 0
                 stream.counted, stream.count_from_s = 0, now_s

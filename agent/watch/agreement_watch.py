@@ -2,9 +2,13 @@
 
 Every packet has a hash of what its sender shares; packets with another one are refused. Whoever meets one tells once
 a second what he shares himself, so that both sides can name the settings in which they differ.
+
+Two daemons of one id have no link to each other. Those who hear both say so in the same message, so that both know.
 """
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 from estimators.integrity.finding import Finding, Gravity, What
 from transport.link.peers import Peer, PeerTable
@@ -15,30 +19,43 @@ REMEMBERED_S = 3.0
 """A disagreement that nobody has shown for longer is over."""
 UNHEARD_S = 1.0
 """What comes unsigned in a drone's name is believed of its version only if nothing of it was accepted for so long."""
+MAX_TWICE = 8
 MAX_TOLD = 100
 """Characters about the settings of one drone: a reason has to fit into a packet."""
 
 
 class AgreementWatch:
-    """Compares; ``own`` is what this agent shares, times are those of the opener that feeds ``peers``."""
+    """Compares; ``own`` is what agent ``own_id`` shares, times are those of the opener that feeds ``peers``."""
 
-    def __init__(self, own: Agreement, peers: PeerTable) -> None:
+    def __init__(self, own: Agreement, peers: PeerTable, own_id: int) -> None:
         self.own = own
         self._peers = peers
+        self._own_id = own_id
         self._told: dict[int, Agreement] = {}
+        self._doubled_s: dict[int, float] = {}
+        """By whom we were told, when, that somebody else has our id."""
 
-    def on_told(self, agent_id: int, agreement: Agreement) -> None:
-        """An agent says what it shares."""
+    def on_told(self, agent_id: int, agreement: Agreement, now: float) -> None:
+        """An agent says what it shares, and of whom it hears two."""
         self._told[agent_id] = agreement
+        if self._own_id in agreement.twice:
+            self._doubled_s[agent_id] = now
 
-    def is_contradicted(self, now: float) -> bool:
-        """Whether somebody shares something else, so that both have to say what."""
-        return any(_is_recent(peer.disagreed_s, now) for _, peer in self._peers.items())
+    def to_tell(self, now: float) -> Agreement | None:
+        """What to say now: something if somebody shares something else, or is heard twice."""
+        twice = tuple(agent_id for agent_id, peer in self._peers.items() if _is_recent(peer.twin_s, now))
+        contradicted = any(_is_recent(peer.disagreed_s, now) for _, peer in self._peers.items())
+        return replace(self.own, twice=twice[:MAX_TWICE]) if twice or contradicted else None
 
     def observe(self, now: float) -> tuple[Finding, ...]:
-        """A finding for each drone that cannot be understood."""
+        """A finding for each drone that cannot be understood, or is there twice."""
         found = []
+        tellers = [agent_id for agent_id, at_s in self._doubled_s.items() if _is_recent(at_s, now)]
+        if tellers:
+            found.append(Finding(What.DOUBLED, Gravity.DEGRADED, detail=f"{tellers[0]}"))
         for agent_id, peer in self._peers.items():
+            if _is_recent(peer.twin_s, now):
+                found.append(Finding(What.HEARD_TWICE, Gravity.DEGRADED, agent_id))
             if _is_recent(peer.disagreed_s, now):
                 detail = self._differing(agent_id)
                 found.append(Finding(What.DISAGREES, Gravity.DEGRADED, agent_id, detail=detail))

@@ -6,7 +6,7 @@ Nothing is judged here: state and reasons follow from what the monitors found (`
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 
 from estimators.integrity.finding import Finding, Gravity, What
@@ -44,6 +44,8 @@ _UNOBSERVABLE = (What.AMBIGUOUS, What.TOO_FEW_RANGED, What.ONE_PLANE, What.MIRRO
 _TEXTS = {
     What.CLOCK: "{0.detail}",
     What.DISAGREES: "{0.about} refused, differs in {0.detail}",
+    What.DOUBLED: "another daemon runs with our id, says {0.detail}",
+    What.HEARD_TWICE: "two daemons run as {0.about}",
     What.OTHER_VERSION: "{0.about} refused, talks version {0.value:.0f} of the packets, not {0.limit:.0f}",
     What.NOT_FUSED: "autopilot does not fuse: {0.detail}",
     What.NOT_FED: "autopilot not fed: {0.detail}",
@@ -75,6 +77,7 @@ _TEXTS = {
     What.IMPOSSIBLE: "{0.detail} impossible, off by {0.value:.0f}, not used",
     What.BEGUN_ANEW: "estimate given up and begun anew, {0.detail}",
     What.AUTOPILOT: "autopilot {0.detail}",
+    What.SLOW_STREAM: "autopilot sends {0.detail}",
     What.IMU_GAP: "IMU incomplete",
     What.UNAIDED: "attitude without aiding",
     What.NO_FIX: "no GPS",
@@ -102,10 +105,25 @@ class Health:
 
 def assess(findings: Iterable[Finding]) -> Health:
     """The health that follows from findings; its reasons in their order."""
+    findings = _with_causes(list(findings))
     told = [finding for finding in findings if finding.gravity > Gravity.NOTED]
     gravest = max((finding.gravity for finding in told), default=Gravity.NOTED)
     alarm = any(finding.gravity is Gravity.ALARM for finding in told)
     return Health(_STATES[gravest], _reasons(told), alarm)
+
+
+def _with_causes(findings: list[Finding]) -> list[Finding]:
+    """The same with slow streams in place of the IMU that is incomplete because of them."""
+    slow = any(finding.what is What.SLOW_STREAM for finding in findings)
+    if not slow or not any(finding.what is What.IMU_GAP for finding in findings):
+        return findings
+    return [
+        replace(finding, gravity=max(finding.gravity, Gravity.DEGRADED))
+        if finding.what is What.SLOW_STREAM
+        else finding
+        for finding in findings
+        if finding.what is not What.IMU_GAP
+    ]
 
 
 def reason_of(finding: Finding) -> str:

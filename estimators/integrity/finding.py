@@ -20,6 +20,10 @@ class What(Enum):
     """The clock is outside the fleet's time: nothing can be sent."""
     DISAGREES = auto()
     """A drone was given something else of what the fleet has to share: its packets are refused."""
+    DOUBLED = auto()
+    """Another daemon runs with the own id."""
+    HEARD_TWICE = auto()
+    """Two daemons send as one drone; one of them is refused."""
     OTHER_VERSION = auto()
     """A drone's packets are of another version: they cannot be read."""
     NOT_FUSED = auto()
@@ -81,6 +85,8 @@ class What(Enum):
     """The estimate was given up, after faults or against its own fixes, and begun from nothing."""
     AUTOPILOT = auto()
     """The link to the autopilot is not there."""
+    SLOW_STREAM = auto()
+    """The autopilot sends what every tick needs less often than it was asked to."""
     IMU_GAP = auto()
     """The IMU was silent for a part of the tick."""
     UNAIDED = auto()

@@ -105,7 +105,8 @@ def _no_autopilot(config: FleetConfig, agent_id: int, heard: Listened, where: st
         to_do = "the baud rate is another one, or the port speaks no MAVLink" if serial else "is that MAVLink?"
         bad = ", ".join(f"{count} {reason}" for reason, count in decoder.bad.items())
         return Examined(Mark.WRONG, where, f"{heard.bytes_read} bytes, no message ({bad or 'nothing'})", to_do)
-    seen = ", ".join(session.ignored) or "no heartbeat"
+    systems = [f"system {each}" for each in sorted(session.other_systems)]
+    seen = ", ".join([*systems, *session.ignored]) or "no heartbeat"
     found = f"{decoder.received} messages, none of {wanted} ({seen})"
     return Examined(Mark.WRONG, where, found, "see agents.system_id")
 

@@ -58,8 +58,6 @@ class CommandHandler:
             mavlink.MAV_CMD_SET_MESSAGE_INTERVAL: self._set_interval,
             mavlink.MAV_CMD_GET_MESSAGE_INTERVAL: self._get_interval,
             mavlink.MAV_CMD_REQUEST_MESSAGE: self._request_message,
-            mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
-            mavlink.MAV_CMD_GET_HOME_POSITION: self._request_home,
             mavlink.MAV_CMD_COMPONENT_ARM_DISARM: self._arm,
             mavlink.MAV_CMD_DO_SET_MODE: self._set_mode,
             mavlink.MAV_CMD_NAV_TAKEOFF: self._take_off,
@@ -68,9 +66,13 @@ class CommandHandler:
             mavlink.MAV_CMD_MISSION_START: self._start_mission,
             mavlink.MAV_CMD_PREFLIGHT_REBOOT_SHUTDOWN: self._reboot,
         }
-        if state.flavour.name == "ardupilot":
-            self._handlers[mavlink.MAV_CMD_SET_EKF_SOURCE_SET] = self._set_source
-            self._handlers[mavlink.MAV_CMD_USER_1] = self._hear_of_spoofing
+        if state.flavour.name == "ardupilot":  # PX4 1.18 has none of these
+            self._handlers |= {
+                mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES: self._request_capabilities,
+                mavlink.MAV_CMD_GET_HOME_POSITION: self._request_home,
+                mavlink.MAV_CMD_SET_EKF_SOURCE_SET: self._set_source,
+                mavlink.MAV_CMD_USER_1: self._hear_of_spoofing,
+            }
 
     def handle(self, command: Command, now: float) -> int:
         """Carry a command out; the MAV_RESULT of its acknowledgement."""

@@ -104,7 +104,7 @@ PX4 = Flavour(
         | mavlink.MAV_PROTOCOL_CAPABILITY_COMMAND_INT
         | mavlink.MAV_PROTOCOL_CAPABILITY_MISSION_INT
     ),
-    software_version=0x010F00FF,
+    software_version=0x011200FF,
     parameters={
         "MAV_SYS_ID": Parameter(1),
         "MIS_TAKEOFF_ALT": Parameter(2.5, integer=False),
@@ -123,7 +123,7 @@ PX4 = Flavour(
     },
     takeoff_height_parameter="MIS_TAKEOFF_ALT",
 )
-"""PX4 1.15 on an onboard link: it streams by itself."""
+"""PX4 1.18 on an onboard link: it streams by itself."""
 
 ARDUPILOT = Flavour(
     name="ardupilot",

@@ -58,6 +58,8 @@ class VirtualAutopilot:
     boot_s: float = 90.0
     system_id: int = 1
     refuses: tuple[int, ...] = ()
+    forgets: tuple[int, ...] = ()
+    """What it accepts to send and does not."""
     deaf: bool = False
     answers_timesync: bool = True
     rates: dict[int, float] = field(default_factory=dict)
@@ -79,7 +81,7 @@ class VirtualAutopilot:
                 message_id = int(message.param1)
                 self.commands.append((message_id, message.param2))
                 result = 4 if message_id in self.refuses else 0
-                if not result:
+                if not result and message_id not in self.forgets:
                     self.rates[message_id] = 1e6 / message.param2
                 self.send(mavlink.MAVLink_command_ack_message(message.command, result, 0, 0, 1, 197))
             elif message.get_type() == "TIMESYNC" and not message.tc1 and self.answers_timesync:

@@ -12,6 +12,8 @@ from transport.messages.header import Header, PacketKind
 
 CLOCK_SAMPLES = 30
 CLOCK_BEST_SHARE = 0.2
+TWIN_NS = 2_000_000_000
+"""Packets of an earlier start so long after the present one began, and no older than that, are of a second daemon."""
 
 
 class ClockFilter:
@@ -75,6 +77,10 @@ class Peer:
         """When it last said, well signed, that it shares something else with the fleet than we do."""
         self.version: tuple[int, float] | None = None
         """Another version of the packets under its key, and when; no signature was looked at."""
+        self.twin_s: float | None = None
+        """When it last turned out that two daemons send under its id."""
+        self._begun_ns = self._newest_ns = 0
+        """Sending time of the first packet since its start, and of the newest."""
         self._boot: int | None = None
         self._numbers: dict[PacketKind, _Numbers] = {}
         self._lost_before = 0
@@ -95,14 +101,26 @@ class Peer:
             self._boot = header.boot
             self._lost_before = self.lost
             self._numbers.clear()
+            self._begun_ns = header.t_ns
         self.received += 1
         self.last_received_s = now
+        self._newest_ns = max(self._newest_ns, header.t_ns)
         if header.kind is PacketKind.CLOCK:
             return  # answers go to whoever asked: the numbers between are other neighbours', not lost
         numbers = self._numbers.setdefault(header.kind, _Numbers(header.seq, header.seq, 0))
         numbers.received += 1
         numbers.first = min(numbers.first, header.seq)
         numbers.newest = max(numbers.newest, header.seq)
+
+    def of_earlier_start(self, header: Header, now: float) -> None:
+        """Note an authentic packet of a start before the present one.
+
+        The present start began later than any packet of an earlier one was sent, unless both are there: then what the
+        earlier one sends is as new as what comes of the present one. Packets that are played back are not.
+        """
+        after_begin_ns, behind_ns = header.t_ns - self._begun_ns, self._newest_ns - header.t_ns
+        if self._boot is not None and after_begin_ns > TWIN_NS and behind_ns < TWIN_NS:
+            self.twin_s = now
 
     def as_dict(self, now: float) -> dict[str, float]:
         """Gauges and counters for a report; what is not known is left out."""
@@ -141,6 +159,10 @@ class PeerTable:
     def accepted(self, header: Header, now: float) -> None:
         """Note a packet that was accepted at ``now``; its sender is in the table."""
         self._peers[header.sender].accepted(header, now)
+
+    def of_earlier_start(self, header: Header, now: float) -> None:
+        """Note an authentic packet of a start before the present one; its sender is in the table."""
+        self._peers[header.sender].of_earlier_start(header, now)
 
     def disagrees(self, agent_id: int, now: float) -> None:
         """Note that an agent shares something else with the fleet than we do."""

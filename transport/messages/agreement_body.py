@@ -1,6 +1,6 @@
 """What a fleet has to share, by the name of its setting: hashed into every packet, told in full where hashes differ.
 
-The body is JSON of names and values. A value is told by its beginning and a hash if it is long, so that any two can
+The body is JSON of names and values, and beside them who is heard twice. A value is told by its beginning and a hash if it is long, so that any two can
 be told from each other and the body fits into a datagram.
 """
 
@@ -18,6 +18,8 @@ from transport.messages.header import MAX_DATAGRAM_BODY_BYTES
 
 LONGEST_VALUE = 48
 _HASH_BYTES = 4
+_TWICE = "twice"
+"""The name under which a body tells of whom two daemons are heard; no setting has it."""
 
 _Text = Annotated[str, msgspec.Meta(min_length=1, max_length=LONGEST_VALUE)]
 _DECODER = msgspec.json.Decoder(Annotated[dict[_Text, _Text], msgspec.Meta(max_length=24)])
@@ -28,6 +30,8 @@ class Agreement:
     """What an agent shares with its fleet: short values by the name of their setting."""
 
     settings: Mapping[str, str]
+    twice: tuple[int, ...] = ()
+    """Agents of whom two daemons are heard, in the eyes of who says so; not a part of what is hashed."""
 
     def differences(self, other: Agreement) -> tuple[str, ...]:
         """The names of which both say different things, or one says nothing, in order."""
@@ -48,7 +52,8 @@ def agreement_hash(agreement: Agreement) -> int:
 
 def encode_agreement(agreement: Agreement) -> bytes:
     """Body of an agreement packet; raises `EncodeError` for names and values that do not fit."""
-    body = msgspec.json.encode(dict(agreement.settings), order="sorted")
+    twice = {_TWICE: " ".join(map(str, agreement.twice))} if agreement.twice else {}
+    body = msgspec.json.encode(dict(agreement.settings) | twice, order="sorted")
     try:
         _DECODER.decode(body)
     except msgspec.ValidationError as error:
@@ -66,7 +71,14 @@ def decode_agreement(body: bytes) -> Agreement:
         raise Rejected(Reason.MALFORMED, f"agreement: {error}") from None
     if not all(text.isprintable() for pair in settings.items() for text in pair):
         raise Rejected(Reason.MALFORMED, "agreement with characters that cannot be shown")
-    return Agreement(settings)
+    return Agreement(settings, _ids(settings.pop(_TWICE, "")))
+
+
+def _ids(text: str) -> tuple[int, ...]:
+    names = text.split()
+    if not all(name.isascii() and name.isdecimal() for name in names):
+        raise Rejected(Reason.MALFORMED, f"agreement: expected ids, found {text!r}")
+    return tuple(int(name) for name in names)
 
 
 def _shortened(value: str) -> str:

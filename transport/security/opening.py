@@ -139,6 +139,10 @@ class Opener:
         self._check_sender(key, header)
         if self._freshness_ns is not None and abs(unix_ns - header.t_ns) > self._freshness_ns:
             raise Rejected(Reason.STALE, f"clock {(unix_ns - header.t_ns) * 1e-9:.3f} s behind ours")
+        if self.replay.is_of_earlier_start(header):
+            if not isinstance(self._trust, Unsigned):
+                verify(self._trust[header.sender], key, packet)
+            self.peers.of_earlier_start(header, now)
         self.replay.check(header)
         body = packet[HEADER_BYTES : HEADER_BYTES + header.body_bytes]
         if not isinstance(self._trust, Unsigned):

@@ -43,6 +43,10 @@ class ReplayGuard:
         """What to keep for the next start."""
         return dict(self._seen)
 
+    def is_of_earlier_start(self, header: Header) -> bool:
+        """Whether its sender has been started anew since."""
+        return header.boot < self._boots.get(header.sender, 0)
+
     def check(self, header: Header) -> None:
         """Raises `Rejected` (DUPLICATE or REPLAY) if the packet is not new."""
         boot = self._boots.get(header.sender, 0)

@@ -12,7 +12,11 @@ import pytest
 from agent.config.tables import FleetConfig
 from agent.mavlink.codec import Encoder, mavlink
 from agent.mavlink.session import AutopilotSession, LinkState
+from agent.mavlink.slow_streams import SlowStreamLog, slow_findings, slow_text
+from agent.mavlink.stream_rates import StreamState
 from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, Sample
+from agent.watch.health import State, assess
+from estimators.integrity.finding import Finding, Gravity, What
 from tests.support.onboard import onboard_of
 
 STEP_S = 0.01
@@ -68,7 +72,9 @@ def test_an_autopilot_is_found_asked_and_understood(bench: Callable[..., Bench],
     assert b.session.state is LinkState.CONNECTED
     assert b.session.autopilot is not None
     assert b.session.autopilot.flavour == {PX4: "px4", ARDUPILOT: "ardupilot"}[flavour]
-    assert [message_id for message_id, _ in b.autopilot.commands] == [HIGHRES, QUATERNION, 24, 2, 32, STATUS[flavour]]
+    asked = [message_id for message_id, _ in b.autopilot.commands]
+    assert asked[:6] == [HIGHRES, QUATERNION, 24, 2, 32, STATUS[flavour]]
+    assert {*asked[6:]} <= {32, STATUS[flavour]}  # which this autopilot accepts and does not send
     assert len(b.of(ImuSample)) == pytest.approx(990, abs=15)
     assert len(b.of(AttitudeSample)) == pytest.approx(495, abs=10)
     assert len(b.of(GpsSample)) == pytest.approx(98, abs=5)
@@ -107,6 +113,17 @@ def test_heartbeats_of_others_are_not_autopilots(bench: Callable[..., Bench]) ->
         b.session.receive(frame, 100.0)
     assert b.session.state is LinkState.SEARCHING
     assert b.session.ignored["heartbeat: other system"] == 1
+    assert b.session.told == "searching: expected system 1, heard 2"
+    b.run(2)
+    assert b.session.told == "connected"
+
+
+def test_of_many_other_systems_a_few_are_named(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    for system in range(10, 60):
+        b.session.receive(Encoder(system, 1).encode(mavlink.MAVLink_heartbeat_message(2, 12, 0, 0, 4, 3)), 100.0)
+    assert b.session.ignored["heartbeat: other system"] == 50
+    assert b.session.told == "searching: expected system 1, heard 10, 11, 12, 13, 14, 15, 16, 17"
 
 
 def test_another_flavour_than_configured_is_refused_by_name(bench: Callable[..., Bench]) -> None:
@@ -155,10 +172,83 @@ def test_a_stream_that_someone_slowed_is_asked_for_again_but_not_at_once(bench: 
     b.run(20)
     asked = [message_id for message_id, _ in b.autopilot.commands]
     assert asked.count(HIGHRES) == 1
-    assert HIGHRES in b.session.rates.slow()
+    (slow,) = needed(b)
+    assert slow_text(slow) == "HIGHRES_IMU at 10 of 100 Hz"
+    (finding,) = slow_findings([slow])
+    assert assess([finding]).reasons == ("autopilot sends HIGHRES_IMU at 10 of 100 Hz",)
     b.run(10)
     assert [message_id for message_id, _ in b.autopilot.commands].count(HIGHRES) == 2
     assert b.autopilot.rates[HIGHRES] == pytest.approx(100.0)
+
+
+def needed(b: Bench) -> list[StreamState]:
+    """Slow streams that this autopilot could send."""
+    return [stream for stream in b.session.slow_streams() if stream.message_id in (HIGHRES, QUATERNION, 24)]
+
+
+def asked_at(b: Bench, message_id: int, duration_s: float) -> list[float]:
+    """How long from now on a message is asked for, within a while."""
+    times, begin_s = [], b.now_s
+
+    def asked() -> int:
+        return [int(each.param1) for each in b.autopilot.received["COMMAND_LONG"]].count(message_id)
+
+    for _ in range(round(duration_s / 0.1)):
+        before = asked()
+        b.run(0.1)
+        times += [b.now_s - begin_s] * (asked() - before)
+    return times
+
+
+def test_a_stream_that_was_accepted_and_stays_silent_is_asked_for_again_after_2_4_and_8_seconds(
+    bench: Callable[..., Bench],
+) -> None:
+    b = bench(forgets=(QUATERNION,))
+    first_s, *again_s = asked_at(b, QUATERNION, 60.0)
+    assert [at_s - first_s for at_s in again_s] == pytest.approx([2.0, 6.0, 14.0, 44.0], abs=0.5)
+    b.autopilot.forgets = ()
+    b.run(32.0)
+    assert QUATERNION in b.autopilot.rates
+    assert needed(b) == []
+
+
+def test_a_stream_that_stops_is_asked_for_within_seconds(bench: Callable[..., Bench]) -> None:
+    b = bench()
+    b.run(40)
+    b.autopilot.rates.pop(QUATERNION)
+    assert len(asked_at(b, QUATERNION, 10.0)) == 1
+    assert QUATERNION in b.autopilot.rates
+
+
+def test_a_stream_that_is_refused_is_not_asked_for_soon_and_not_called_slow(bench: Callable[..., Bench]) -> None:
+    b = bench(autopilot=ARDUPILOT, refuses=(HIGHRES,))
+    assert len(asked_at(b, HIGHRES, 20.0)) == 1
+    assert needed(b) == []
+
+
+def test_an_incomplete_imu_is_told_by_its_slow_stream() -> None:
+    gap = Finding(What.IMU_GAP, Gravity.DEGRADED, value=0.5, limit=0.8)
+    (slow,) = slow_findings([StreamState(HIGHRES, 100.0, rate_hz=45.0)])
+    assert assess([slow]).state is State.OK  # the coverage decides
+    assert assess([gap]).reasons == ("IMU incomplete",)
+    assert assess([slow, gap]).reasons == ("autopilot sends HIGHRES_IMU at 45 of 100 Hz",)
+    assert assess([slow, gap]).state is State.DEGRADED
+    (useless,) = slow_findings([StreamState(QUATERNION, 50.0, rate_hz=0.0)])
+    assert assess([useless]).state is State.DEGRADED
+    assert slow_findings([StreamState(32, 2.0, rate_hz=0.0)]) == ()  # for comparison only
+
+
+def test_a_slow_stream_is_logged_once_and_one_that_comes_and_goes_once_a_minute() -> None:
+    log, slow = SlowStreamLog(), [StreamState(HIGHRES, 100.0, rate_hz=13.2)]
+    line = "autopilot sends HIGHRES_IMU at 13.2 of 100 Hz"
+    assert log.lines(slow, 0.0) == [line]
+    assert log.lines(slow, 100.0) == []
+    assert log.lines([], 101.0) == []
+    assert log.lines(slow, 102.0) == [line]
+    assert log.lines([], 103.0) == []
+    assert log.lines(slow, 104.0) == []
+    unknown = StreamState(60000, 2.0, rate_hz=0.5)
+    assert log.lines([unknown], 105.0) == ["autopilot sends message 60000 at 0.5 of 2 Hz"]
 
 
 def test_a_lost_autopilot_is_noticed_and_taken_back(bench: Callable[..., Bench]) -> None:

@@ -62,6 +62,24 @@ def test_losses_follow_from_each_senders_sequence() -> None:
     assert decoder.lost == 30
 
 
+def test_messages_of_unknown_ids_are_not_lost() -> None:
+    sent = [bytearray(frame) for frame in frames(300)]
+    for number in range(0, 300, 3):
+        sent[number][7:10] = (60000).to_bytes(3, "little")
+    perfect, lossy, garbled = (Decoder(datagrams=True) for _ in range(3))
+    for number, frame in enumerate(sent):
+        perfect.feed(bytes(frame))
+        if number % 50 != 10:
+            lossy.feed(bytes(frame))
+    assert (perfect.lost, perfect.bad["unknown message"], perfect.received) == (0, 100, 200)
+    assert lossy.lost == 6
+    # a number far from the last one is nobody's word
+    sent[0][4] = 200
+    for frame in (sent[1], sent[0], sent[2]):
+        garbled.feed(bytes(frame))
+    assert garbled.lost == 0
+
+
 def test_mavlink_1_and_truncated_zeros_are_understood() -> None:
     packer = mavlink.MAVLink(None, 1, 1)
     frame = bytes(attitude(0).pack(packer, force_mavlink1=True))

@@ -114,7 +114,7 @@ def test_another_system_id_a_wrong_baud_rate_and_silence_are_told_apart() -> Non
     [garbled] = of_autopilot(serial, 1, heard(config, "px4", 3.0, garble=True))
     [silent] = of_autopilot(config, 1, Listened(onboard_of(config, linked=True)))
 
-    assert "none of system 1 (heartbeat: other system" in other.found
+    assert "none of system 1 (system 9, heartbeat: other system" in other.found
     assert (garbled.mark, "baud rate" in garbled.to_do) == (Mark.WRONG, True)
     assert silent.found == "nothing came"
 

@@ -28,13 +28,21 @@ def test_unknown_commands_and_messages_are_unsupported(connect, flavour):
 
 
 @BOTH
-def test_the_version_is_served_for_both_commands(connect, flavour):
+def test_the_version_is_served_on_request(connect, flavour):
     client = connect(Vehicle(1, flavour, 7, **HOVER))
     assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, 148) == OK
-    assert client.command(mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1) == OK
-    first, second = client.received["AUTOPILOT_VERSION"]
-    assert first.capabilities == second.capabilities
-    assert first.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+    (version,) = client.received["AUTOPILOT_VERSION"]
+    assert version.capabilities & mavlink.MAV_PROTOCOL_CAPABILITY_MAVLINK2
+
+
+@BOTH
+def test_the_older_requests_for_version_and_home_are_ardupilots_alone(connect, flavour):
+    client = connect(Vehicle(1, flavour, 7, **HOVER))
+    client.run_to(0.5)
+    expected = OK if flavour == "ardupilot" else UNSUPPORTED
+    assert client.command(mavlink.MAV_CMD_REQUEST_AUTOPILOT_CAPABILITIES, 1) == expected
+    assert client.command(mavlink.MAV_CMD_GET_HOME_POSITION) == expected
+    assert len(client.received["AUTOPILOT_VERSION"]) == (expected == OK)
 
 
 @BOTH
@@ -45,7 +53,6 @@ def test_streamed_messages_can_be_had_once(connect, flavour):
     assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_GPS_RAW_INT) == OK
     assert len(client.received["GPS_RAW_INT"]) == before + 1
     assert client.command(mavlink.MAV_CMD_REQUEST_MESSAGE, mavlink.MAVLINK_MSG_ID_HOME_POSITION) == OK
-    assert client.command(mavlink.MAV_CMD_GET_HOME_POSITION) == OK
 
 
 @BOTH

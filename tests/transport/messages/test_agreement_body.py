@@ -41,6 +41,14 @@ def test_another_value_is_another_hash_and_named_however_long_it_is(
         assert agreement_of(original).differences(agreement_of(changed)) == (name,)
 
 
+def test_who_is_heard_twice_is_told_and_not_hashed() -> None:
+    plain = Agreement({"a": "1"})
+    told = Agreement({"a": "1"}, twice=(2, 17))
+    assert decode_agreement(encode_agreement(told)) == told
+    assert agreement_hash(told) == agreement_hash(plain)
+    assert told.differences(plain) == ()
+
+
 def test_who_does_not_name_a_setting_differs_in_it() -> None:
     assert Agreement({"a": "1"}).differences(Agreement({"a": "1", "b": "2"})) == ("b",)
 
@@ -59,6 +67,9 @@ def test_who_does_not_name_a_setting_differs_in_it() -> None:
         b'{"a":' + b"[" * 1000,
         msgspec.json.encode({f"k{i}": "v" for i in range(25)}),
         msgspec.json.encode({"a": "v" * 49}),
+        b'{"twice":"1 x"}',
+        b'{"twice":"-1"}',
+        '{"twice":"\u0661"}'.encode(),
     ],
 )
 def test_what_is_no_agreement_is_refused(body: bytes) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,12 +82,43 @@ def verdict(figures: Mapping[str, Any], required: Mapping[str, float]) -> RunVer
         failures.append("no daemon was left")
     elif dead:
         notes.append(f"ended in flight: {', '.join(dead)}")
+    notes += said_of_drones(agents)
     if fleet["interrupted"]:
         notes.append("interrupted")
     word = "FAILED" if failures else "passed"
     available = fleet["availability"]
     shown = "" if available is None else f"available {100 * available:.1f} %"
     return RunVerdict(f"{word}: {'; '.join(filter(None, (*failures, *notes, shown)))}", bool(failures))
+
+
+def said_of_drones(agents: Sequence[Mapping[str, Any]]) -> list[str]:
+    """What the drones of a replay said of themselves: alarms, doubts, and what was not used, a part for each kind."""
+    alarms, doubts, refusals = [], [], []
+    for agent in agents:
+        said, expected = agent.get("said"), agent["ticks_expected"]
+        if said is None or not expected:
+            continue
+        if said["alarm"]["ticks"]:
+            alarms.append(f"{agent['id']} in {_share(said['alarm']['ticks'], expected)}")
+        if said["doubts"]:
+            doubts.append(f"{agent['id']} ({_listed(said['doubts'], expected)})")
+        count = sum(agent["refused"].values()) + sum(agent["packets"]["rejected"].values())
+        told = [_listed(said["refusals"], expected)] if said["refusals"] else []
+        told += [f"{count} item(s)"] if count else []
+        if told:
+            refusals.append(f"{agent['id']} ({', '.join(told)})")
+    kinds = {"alarm of": alarms, "doubts of": doubts, "not used by": refusals}
+    return [f"{words} {', '.join(found)}" for words, found in kinds.items() if found]
+
+
+def _listed(said: Mapping[str, Any], expected: int) -> str:
+    """The commonest of what was said first."""
+    ordered = sorted(said.items(), key=lambda each: -each[1]["ticks"])
+    return ", ".join(f"{name.replace('_', ' ')} {_share(spell['ticks'], expected)}" for name, spell in ordered)
+
+
+def _share(ticks: int, expected: int) -> str:
+    return f"{100 * ticks / expected:.1f} %"
 
 
 def _bound(name: str, limit: float) -> str:

@@ -167,16 +167,30 @@ def read_entries(path: Path) -> tuple[EstimateLogHeader, NDArray[np.void]]:
     except OSError as error:
         raise LogFileError(f"record {path}: cannot be read: {error.strerror}") from error
     line, newline, content = raw.partition(b"\n")
+    header = _header(path, line + newline)
+    dtype = entry_dtype(len(header.agents), header.joint)
+    whole = len(content) // dtype.itemsize
+    return header, np.frombuffer(content, dtype, whole)
+
+
+def header_in(path: Path) -> EstimateLogHeader:
+    """The header of a file; raises `LogFileError` naming the file and what is wrong."""
+    try:
+        with path.open("rb") as file:
+            return _header(path, file.readline())
+    except OSError as error:
+        raise LogFileError(f"record {path}: cannot be read: {error.strerror}") from error
+
+
+def _header(path: Path, line: bytes) -> EstimateLogHeader:
     try:
         header = msgspec.json.decode(line, type=EstimateLogHeader)
     except msgspec.DecodeError as error:
         raise LogFileError(f"record {path}: expected a first line of {FORMAT}: {error}") from error
     expected = FORMAT if header.joint is None else FORMAT_JOINT
-    if header.format != expected or not newline:
+    if header.format != expected or not line.endswith(b"\n"):
         raise LogFileError(f"record {path}: expected {expected}, found {header.format!r}")
-    dtype = entry_dtype(len(header.agents), header.joint)
-    whole = len(content) // dtype.itemsize
-    return header, np.frombuffer(content, dtype, whole)
+    return header
 
 
 def record_chunks(path: Path, agents: int) -> Iterator[NDArray[np.void]]:

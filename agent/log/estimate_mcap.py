@@ -4,7 +4,8 @@ Two channels per agent, both JSON with a schema:
 
 ======================  ====================================================================================
 ``/agent_001/estimate``  agent 1's estimate of the whole fleet: NED m and m/s with 1-sigma, age, status
-``/agent_001/poses``     the same positions as ``foxglove.PosesInFrame``, for a 3D panel (axes north up: ENU)
+``/agent_001/poses``     the same positions as ``foxglove.PosesInFrame``, for a 3D panel (axes north up: ENU);
+                         drones that are no part of the estimate are not there
 ======================  ====================================================================================
 
 Numbers are written with as many digits as a float64 needs, so what is read is what was estimated, bit by bit.
@@ -204,8 +205,12 @@ class McapFile:
 class EstimateChannels:
     """Writes estimates to a file that also holds other things."""
 
-    def __init__(self, file: McapFile, agents: tuple[int, ...], period_s: float, epoch_unix_s: float) -> None:
+    def __init__(
+        self, file: McapFile, agents: tuple[int, ...], period_s: float, epoch_unix_s: float, *, whole: bool = True
+    ) -> None:
+        """``whole``: drones that are no part of an estimate are in its message too, as the estimator holds them."""
         self._file = file
+        self._whole = whole
         self._agents = agents
         self._period_s = period_s
         self._epoch_unix_s = epoch_unix_s
@@ -215,10 +220,14 @@ class EstimateChannels:
         """Append what an agent estimated; ``published_s`` fleet time."""
         message = estimate_message(ready, published_s, self._agents, self._period_s, inputs)
         unix_ns = round((self._epoch_unix_s + published_s) * 1e9)
+        there = {name: agent for name, agent in message.agents.items() if agent.age_s is not None}
+        poses = _poses(message.t_s, there, self._epoch_unix_s)
+        if not self._whole:
+            message = msgspec.structs.replace(message, agents=there)
         channel = self._file.channel(estimate_topic(agent_id), ESTIMATE_SCHEMA, self._estimate_schema)
         self._file.add(channel, unix_ns, msgspec.json.encode(message), ready.estimate.tick & 0xFFFFFFFF)
         channel = self._file.channel(f"/{agent_key(agent_id)}/poses", POSES_SCHEMA, POSES)
-        self._file.add(channel, unix_ns, msgspec.json.encode(_poses(message, self._epoch_unix_s)))
+        self._file.add(channel, unix_ns, msgspec.json.encode(poses))
 
 
 class EstimateMcap:
@@ -235,10 +244,18 @@ class EstimateMcap:
             self._file = McapFile(path.open("wb"))
         except OSError as error:
             raise _unwritable(path, error) from error
-        self._channels = EstimateChannels(self._file, agents, period_s, epoch_unix_s)
+        self._channels = EstimateChannels(self._file, agents, period_s, epoch_unix_s, whole=False)
+
+    @property
+    def file(self) -> McapFile:
+        """For whoever adds channels of its own; that raises `OSError`."""
+        return self._file
 
     def write(self, agent_id: int, ready: EstimateReady, published_s: float) -> None:
-        """Append what an agent estimated; ``published_s`` fleet time. Raises `LogFileError`."""
+        """Append what an agent estimated, of the drones that it knows; ``published_s`` fleet time.
+
+        Raises `LogFileError`.
+        """
         try:
             self._channels.write(agent_id, ready, published_s)
         except OSError as error:
@@ -303,13 +320,24 @@ def estimate_schema(agents: tuple[int, ...]) -> dict[str, Any]:
     return {"title": ESTIMATE_SCHEMA, **fields}
 
 
-def _poses(message: EstimateMessage, epoch_unix_s: float) -> dict[str, Any]:
+def _poses(t_s: float, there: dict[str, AgentEstimate], epoch_unix_s: float) -> dict[str, Any]:
     """Positions as Foxglove's 3D panel wants them: z up. Attitudes are not estimated: none is turned."""
-    sec, nsec = divmod(round((epoch_unix_s + message.t_s) * 1e9), 10**9)
-    places = [agent.position_m for agent in message.agents.values()]
-    level = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
     return {
-        "timestamp": {"sec": sec, "nsec": nsec},
+        "timestamp": stamp(epoch_unix_s + t_s),
         "frame_id": POSES_FRAME,
-        "poses": [{"position": {"x": p.east, "y": p.north, "z": -p.down}, "orientation": level} for p in places],
+        "poses": [{"position": enu(agent.position_m), "orientation": LEVEL} for agent in there.values()],
     }
+
+
+LEVEL = {"x": 0.0, "y": 0.0, "z": 0.0, "w": 1.0}
+
+
+def stamp(unix_s: float) -> dict[str, int]:
+    """A time as Foxglove's messages have it."""
+    sec, nsec = divmod(round(unix_s * 1e9), 10**9)
+    return {"sec": sec, "nsec": nsec}
+
+
+def enu(place_m: Ned) -> dict[str, float]:
+    """A place in `POSES_FRAME`."""
+    return {"x": place_m.east, "y": place_m.north, "z": -place_m.down}

@@ -6,7 +6,7 @@ Nothing is judged here: state and reasons follow from what the monitors found (`
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from enum import StrEnum
 
 from estimators.integrity.finding import Finding, Gravity, What
@@ -97,6 +97,8 @@ class Health:
     reasons: tuple[str, ...]
     alarm: bool = False
     """Whether the own position may be wrong without the covariance saying so: without GPS, and not held by ranges."""
+    findings: tuple[Finding, ...] = field(default=(), compare=False, repr=False)
+    """What it follows from."""
 
     def __str__(self) -> str:
         state = f"ALARM, {self.state}" if self.alarm else str(self.state)
@@ -109,7 +111,7 @@ def assess(findings: Iterable[Finding]) -> Health:
     told = [finding for finding in findings if finding.gravity > Gravity.NOTED]
     gravest = max((finding.gravity for finding in told), default=Gravity.NOTED)
     alarm = any(finding.gravity is Gravity.ALARM for finding in told)
-    return Health(_STATES[gravest], _reasons(told), alarm)
+    return Health(_STATES[gravest], _reasons(told), alarm, tuple(told))
 
 
 def _with_causes(findings: list[Finding]) -> list[Finding]:

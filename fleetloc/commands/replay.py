@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from fleetloc.options import Delay, FiguresFile, Loss, Overrides, with_options
+from fleetloc.options import Delay, FiguresFile, Loss, Overrides, Require, with_options
 
 if TYPE_CHECKING:
     from agent.config.documents import Override
@@ -51,7 +51,8 @@ def replay(
         str | None, typer.Option("--estimator", help="Kind of estimator in place of the file's.")
     ] = None,
     from_s: Annotated[
-        float | None, typer.Option("--from", help="Begin there: s from the start, negative: from the end.")
+        float | None,
+        typer.Option("--from", help="Begin there: s from where all logs are there, negative: from the end of that."),
     ] = None,
     to_s: Annotated[float | None, typer.Option("--to", help="End there, likewise.")] = None,
     arrival: Annotated[
@@ -64,19 +65,24 @@ def replay(
     overrides: Overrides = None,
     out: Annotated[Path | None, typer.Option("--out", help="Folder of the results; default: out/replay.")] = None,
     json_file: FiguresFile = None,
+    require: Require = None,
 ) -> None:
     """Replay recorded flights: what would the fleet have known?
 
     And how sure, and how does it compare?
 
-    Times are seconds from the start of the logs, negative from their end. Writes report.html, report.json and the
-    estimates as CSV and MCAP. Flight logs of our own daemons are repeated exactly and compared instead.
+    Times are seconds from where all logs are there, negative from where the first of them ends. Writes report.html,
+    report.json and the estimates as CSV and MCAP. Flight logs of our own daemons are repeated exactly and compared
+    instead.
     """
+    from fleetloc.errors import FAILED
     from fleetloc.report.replay_exports import exporting
     from fleetloc.run.replay_run import clear, refuse_inputs, run_replay
     from fleetloc.run.replay_setup import Options, prepare, split_truth
+    from fleetloc.verdict import read_requirements
     from fleetloc.warmup import announce, warm_up_everything
 
+    required = read_requirements(require or "")
     began_s = time.monotonic()
     truth_given = truth
     logs, truth = split_truth(logs, truth or ())
@@ -91,7 +97,7 @@ def replay(
     if any(path.suffix == ".mcap" for path in logs):
         given = {"--ranges": ranges_from, "--truth": truth_given, "--drop-gps": drop_gps, "--fault": fault,
                  "--loss": loss, "--delay": delay_s, "--from": from_s, "--to": to_s, "--seed": seed,
-                 "--arrival": None if arrival == "logged" else arrival}  # fmt: skip
+                 "--require": require, "--arrival": None if arrival == "logged" else arrival}  # fmt: skip
         refused = [name for name, value in given.items() if value is not None]
         _repeat(config, logs, refused, settings, folder, json_file)
         return
@@ -117,11 +123,13 @@ def replay(
     replayed = run_replay(prepared, folder)
     inputs = prepared.inputs
     agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
-    with exporting(folder, prepared.config, agents, inputs.plan.start_s, inputs.plan.epoch_unix_s):
+    with exporting(folder, prepared.config, agents, inputs.plan.zero_s, inputs.plan.epoch_unix_s):
         from fleetloc.report.replay_report import write_report  # loading it takes as long as the export
 
-        write_report(prepared, replayed, folder, json_file, began_s)
+        figures = write_report(prepared, replayed, folder, json_file, began_s, required)
     typer.echo(f"report: {folder / 'report.html'}")
+    if figures["verdict"]["failed"]:
+        raise typer.Exit(FAILED)
 
 
 def _repeat(

@@ -1,4 +1,4 @@
-"""``fleetloc report``: the report of a run whose daemons and simulator were started one by one."""
+"""What is made of a run's folder: ``fleetloc report``, the report; ``fleetloc export``, files for other tools."""
 
 from __future__ import annotations
 
@@ -14,8 +14,9 @@ LOOK_PERIOD_S = 0.2
 
 
 def register(app: typer.Typer) -> None:
-    """Add the command to the command line."""
+    """Add the commands to the command line."""
     app.command("report")(report)
+    app.command("export")(export)
 
 
 def report(
@@ -55,6 +56,31 @@ def report(
     typer.echo(f"report: {directory / run_files.REPORT_HTML}")
     if figures["verdict"]["failed"]:
         raise typer.Exit(FAILED)
+
+
+def export(
+    config: FleetFile,
+    directory: Annotated[Path, typer.Argument(help="Folder with the agents' records.")],
+    out: Annotated[
+        Path | None, typer.Option("--out", metavar="DIR", help="Where the files go; default: beside the records.")
+    ] = None,
+    profiles: Profiles = None,
+    overrides: Overrides = None,
+) -> None:
+    """Make files for other tools of a finished run.
+
+    It writes estimates.mcap (Foxglove, PlotJuggler) with foxglove-layout.json, tracks.kml and tracks.geojson (maps).
+    Fixes and ranges are in them where there are flight logs.
+    """
+    from agent.config.reading import load_config
+    from fleetloc.export.flown import export_run
+    from fleetloc.run.run_files import MCAP
+
+    fleet = load_config(config, overrides or (), profiles or ())
+    folder = out or directory
+    for line in export_run(fleet, directory, folder):
+        typer.echo(f"note: {line}")
+    typer.echo(f"files: {folder / MCAP} and beside it")
 
 
 def _wait_for(files: list[Path], wait_s: float) -> None:

@@ -202,9 +202,9 @@ def _of_fleet(results: FleetResults, agents: list[dict[str, Any]]) -> dict[str, 
         "ticks_expected": expected,
         "ticks_on_time": on_time,
         "ticks_on_time_fraction": on_time / expected if expected else None,
-        **{key: _root_mean_square(agent[key] for agent in agents) for key in
+        **{key: root_mean_square(agent[key] for agent in agents) for key in
            ("position_rmse_m", "position_rmse_after_10s_m", "norm_full_rms", "norm_full_rms_after_10s")},
-        **{key: _mean_known(agent[key] for agent in agents) for key in
+        **{key: mean_known(agent[key] for agent in agents) for key in
            ("anees", "anees_after_10s", "availability", "availability_after_10s")},
         "tick_time_p50_s": _percentile(times, 50),
         "tick_time_p99_s": _percentile(times, 99),
@@ -244,12 +244,14 @@ def _percentile(values: Floats, percent: float) -> float | None:
     return float(np.percentile(values, percent)) if len(values) and values.any() else None
 
 
-def _root_mean_square(values: Iterable[float | None]) -> float | None:
+def root_mean_square(values: Iterable[float | None]) -> float | None:
+    """Of those that are known; ``None`` of none."""
     known = [value for value in values if value is not None]
     return float(np.sqrt(np.mean(np.square(known)))) if known else None
 
 
-def _mean_known(values: Iterable[float | None]) -> float | None:
+def mean_known(values: Iterable[float | None]) -> float | None:
+    """The mean of those that are known; ``None`` of none."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None
 

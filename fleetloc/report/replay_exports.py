@@ -13,16 +13,18 @@ from numpy.typing import NDArray
 
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import covariance_of, record_chunks
-from agent.log.estimate_mcap import EstimateMcap
 from agent.outputs import EstimateReady
+from agent.sensing.samples import Triple
 from estimators.estimator import Estimate, Status
 from estimators.model.layout import STATES_PER_AGENT, Layout
 from fleetloc.errors import InputError
+from fleetloc.export.plot_files import PlotFiles
+from fleetloc.export.plot_schemas import columns_of
 from fleetloc.run import run_files
 from sim_bridge import side_process
 from sim_bridge.replay.comparison import located
+from sim_bridge.replay.tracks import MeasuredRange, WrittenTrack, measured_path, read_measured, track_path
 
-MCAP = "estimates.mcap"
 TABLE_SUFFIX = ".csv"
 
 
@@ -52,25 +54,37 @@ def exporting(
 def export(
     directory: Path, config: FleetConfig, agents: Sequence[int], start_s: float, epoch_unix_s: float | None
 ) -> None:
-    """``agent_001.csv`` of each agent and ``estimates.mcap`` of all, in the order of publication.
+    """``agent_001.csv`` of each agent, and what `fleetloc.export.plot_files` makes of all, in the order of time.
 
     Ticks at which an agent had not located itself are left out. Tables count time from fleet time ``start_s``;
     ``epoch_unix_s``: Unix time of fleet time zero, where it is known.
     """
     with ExitStack() as files:
-        fleet = config.fleet
-        mcap = files.enter_context(
-            closing(EstimateMcap(directory / MCAP, config.bodies, fleet.period_s, fleet.epoch_unix_s))
-        )
+        plots = files.enter_context(closing(PlotFiles(directory, config, agents, start_s)))
         tables = {}
         for agent_id in agents:
             path = run_files.record_path(directory, agent_id).with_suffix(TABLE_SUFFIX)
             tables[agent_id] = files.enter_context(closing(CsvWriter(path, config.bodies, epoch_unix_s, start_s)))
-        streams = [_located_entries(directory, Layout(config.bodies), agent_id) for agent_id in agents]
-        for published_s, agent_id, entry in heapq.merge(*streams, key=itemgetter(0)):
-            ready = _ready(entry, config, published_s)
-            tables[agent_id].write(ready)
-            mcap.write(agent_id, ready, published_s)
+        streams: list[Iterator[tuple[float, int, np.void | Triple | MeasuredRange]]] = [
+            stream
+            for agent_id in agents
+            for stream in (
+                _located_entries(directory, Layout(config.bodies), agent_id),
+                _fixes(directory, agent_id),
+                _ranges(directory, agent_id),
+            )
+        ]
+        for at_s, agent_id, thing in heapq.merge(*streams, key=itemgetter(0)):
+            if isinstance(thing, MeasuredRange):
+                plots.range(agent_id, thing.target, at_s, thing.range_m, thing.sigma_m)
+            elif isinstance(thing, tuple):
+                plots.fix(agent_id, at_s, thing, at_s)
+            else:
+                ready = _ready(thing, config, at_s)
+                tables[agent_id].write(ready)
+                plots.estimate(agent_id, ready, at_s)
+        for agent_id in agents:
+            plots.truth(agent_id, _points(directory, "truth", agent_id))
 
 
 def _located_entries(directory: Path, layout: Layout, agent_id: int) -> Iterator[tuple[float, int, np.void]]:
@@ -79,6 +93,25 @@ def _located_entries(directory: Path, layout: Layout, agent_id: int) -> Iterator
         there: NDArray[np.void] = chunk[located(chunk, layout, agent_id)]
         for entry in there:
             yield float(entry["published_s"]), agent_id, entry
+
+
+def _points(directory: Path, kind: str, agent_id: int) -> Iterator[tuple[float, Triple]]:
+    """Fleet times and places of a track."""
+    for entry in WrittenTrack(track_path(directory, kind, agent_id)).entries:
+        north, east, down = entry["position_m"].tolist()
+        yield float(entry["t_s"]), (north, east, down)
+
+
+def _fixes(directory: Path, agent_id: int) -> Iterator[tuple[float, int, Triple]]:
+    """When it arrived, agent, and place of every fix."""
+    for t_s, place_m in _points(directory, "gps_received", agent_id):
+        yield t_s, agent_id, place_m
+
+
+def _ranges(directory: Path, agent_id: int) -> Iterator[tuple[float, int, MeasuredRange]]:
+    """When it was measured, by whom, and every range."""
+    for t_s, measured in read_measured(measured_path(directory, agent_id)):
+        yield t_s, agent_id, measured
 
 
 def _ready(entry: np.void, config: FleetConfig, published_s: float) -> EstimateReady:
@@ -99,10 +132,7 @@ class CsvWriter:
         self._file = path.open("w", encoding="ascii")
         self._count = len(agents)
         self._epoch_unix_s, self._start_s = epoch_unix_s, start_s
-        names = [f"{name}_{agent}" for agent in agents for name in (
-            "n_m", "e_m", "d_m", "vn_mps", "ve_mps", "vd_mps",
-            "sigma_n_m", "sigma_e_m", "sigma_d_m", "sigma_vn_mps", "sigma_ve_mps", "sigma_vd_mps", "age_ticks",
-        )]  # fmt: skip
+        names = columns_of(agents)
         self._file.write(",".join(("time_s", "time_unix_s", "status", *names)) + "\n")
         self._format = ",".join(["%.3f,%s,%d", *[",".join(["%.4f"] * 12 + ["%d"])] * len(agents)]) + "\n"
 

@@ -10,14 +10,14 @@ from typing import Any
 
 from agent.config.reading import effective
 from estimators.model.layout import Layout
-from fleetloc.report.fleet_report import counted_packets, counted_sensors
+from fleetloc.report.fleet_report import counted_packets, counted_sensors, mean_known, root_mean_square
 from fleetloc.run import run_files
-from fleetloc.run.replay_run import Replayed, track_path
+from fleetloc.run.replay_run import Replayed
 from fleetloc.run.replay_setup import Prepared
 from sim_bridge.replay.comparison import Compared, ComparedTracks, Errors, Phase, compare, first_estimate_s
 from sim_bridge.replay.logs.events import LogSource
 from sim_bridge.replay.naming import names_apart
-from sim_bridge.replay.tracks import WrittenTrack
+from sim_bridge.replay.tracks import WrittenTrack, track_path
 
 SETTLED_S = 10.0
 """Figures are also given from here on after an agent's first estimate, when its start is forgotten."""
@@ -64,12 +64,12 @@ def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
     phases = [Phase(ALL, begin_s, inputs.to_s), Phase(SETTLED, begin_s + SETTLED_S, inputs.to_s)]
     for agent_id, windows in inputs.drops.windows.items():
         for from_s, to_s in windows:
-            zero_s = inputs.plan.start_s
+            zero_s = inputs.plan.zero_s
             name = f"gps of {agent_id} dropped {from_s - zero_s:.0f}..{to_s - zero_s:.0f} s"
             phases.append(Phase(name, max(from_s, begin_s), to_s))
     for fault in inputs.injection.faults:
-        from_s, to_s = inputs.plan.start_s + fault.from_s, min(inputs.plan.start_s + fault.end_s, inputs.to_s)
-        name = f"{fault.__struct_config__.tag} {fault.from_s:.0f}..{to_s - inputs.plan.start_s:.0f} s"
+        from_s, to_s = inputs.plan.zero_s + fault.from_s, min(inputs.plan.zero_s + fault.end_s, inputs.to_s)
+        name = f"{fault.__struct_config__.tag} {fault.from_s:.0f}..{to_s - inputs.plan.zero_s:.0f} s"
         phases.append(Phase(name, max(from_s, begin_s), to_s))
     return phases
 
@@ -77,10 +77,10 @@ def _phases(prepared: Prepared, first_s: float | None) -> list[Phase]:
 def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResults) -> dict[str, Any]:
     """The content of ``report.json`` but for how long it all took; units are in the names, what is not known is null.
 
-    Times are seconds from the start of the logs.
+    Times are seconds from where all logs are there; without such a time, from the start of the first.
     """
     inputs, counts = prepared.inputs, replayed.counts
-    zero_s = inputs.plan.start_s
+    zero_s = inputs.plan.zero_s
     duration_s = max(counts.last_s - inputs.from_s - counts.left_out_s, prepared.config.fleet.period_s)
     names = names_apart(source.path for source in prepared.sources)
     agents = [_of_agent(prepared, replayed, results, agent_id) for agent_id in results.compared]
@@ -91,6 +91,7 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResult
         "from_s": inputs.from_s - zero_s,
         "to_s": max(counts.last_s, inputs.from_s) - zero_s,
         "duration_s": duration_s,
+        "all_there_s": None if inputs.plan.overlap_s is None else inputs.plan.overlap_s[1] - zero_s,
         "truth": prepared.truth_from,
         "ranges": prepared.ranges_from,
         "synthetic_ranges": prepared.synthetic,
@@ -104,7 +105,8 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResult
         ],
         "faults": inputs.injection.described(),
         "agents": agents,
-        "fleet": {
+        "fleet": _pooled(agents)
+        | {
             "engine_wall_s": replayed.wall_s,
             "engine_cpu_s": replayed.cpu_s,
             "silences_left_out": counts.leaps,
@@ -116,6 +118,29 @@ def report_figures(prepared: Prepared, replayed: Replayed, results: ReplayResult
         },
         "logs": [_of_log(source, names[source.path]) for source in prepared.sources],
     }
+
+
+def _pooled(agents: list[dict[str, Any]]) -> dict[str, Any]:
+    """The figures of all drones together, as a live run has them."""
+    expected, on_time = (sum(agent[key] for agent in agents) for key in ("ticks_expected", "ticks_on_time"))
+    without = sum(agent["ticks_without_estimate"] for agent in agents)
+    return {
+        "ticks_expected": expected,
+        "ticks_on_time": on_time,
+        "ticks_on_time_fraction": on_time / expected if expected else None,
+        "availability": 1.0 - without / expected if expected else None,
+        **{name: root_mean_square(agent[name] for agent in agents)
+           for name in ("position_rmse_m", "position_rmse_after_10s_m", "norm_full_rms", "norm_full_rms_after_10s")},
+        **{name: mean_known(agent[name] for agent in agents)
+           for name in ("anees", "anees_own", "anees_after_10s")},
+        "interrupted": False,
+        "deaths": [],
+    }  # fmt: skip
+
+
+def _refused(name: str) -> bool:
+    """Whether a counter is of something that came and was not believed."""
+    return name.startswith(("refused ", "impossible ")) or name.endswith(": refused") or ": refused of" in name
 
 
 def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, agent_id: int) -> dict[str, Any]:
@@ -136,7 +161,7 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
         "ticks_expected": compared.ticks,
         "ticks_on_time": counters["ticks"] - counters["ticks: late"],
         "ticks_without_estimate": compared.without_estimate,
-        "first_estimate_s": None if first_s is None else first_s - plan.start_s,
+        "first_estimate_s": None if first_s is None else first_s - plan.zero_s,
         "statuses": compared.statuses,
         **whole,
         "position_rmse_after_10s_m": settled["position_rmse_m"],
@@ -147,11 +172,13 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
         "cpu_fraction": None,
         "rss_mb": None,
         "phases": {
-            phase.name: {"from_s": phase.from_s - plan.start_s, "to_s": phase.to_s - plan.start_s}
+            phase.name: {"from_s": phase.from_s - plan.zero_s, "to_s": phase.to_s - plan.zero_s}
             | _of_errors(compared.errors[phase.name])
             for phase in results.phases[agent_id]
         },
         "ticks_alarm": counters["ticks: alarm"],
+        "said": replayed.said[agent_id].figures(plan.zero_s),
+        "refused": {name.removeprefix("refused "): n for name, n in sorted(counters.items()) if _refused(name) and n},
         "integrity": of_integrity(counters),
         "fit": replayed.fit[agent_id].figures(),
         "packets": counted_packets(counters),

@@ -7,7 +7,7 @@ from typing import Any
 
 from fleetloc.extras import is_installed, sentence
 from fleetloc.report.replay_figures import ReplayResults
-from fleetloc.report.replay_tables import cautions, error_table, fit_table, log_table
+from fleetloc.report.replay_tables import ANEES_EXPLAINED, cautions, error_table, fit_table, log_table
 from fleetloc.report.report_html import CSS, counted
 from fleetloc.report.style import NO_PLOTS, colour
 from fleetloc.run.replay_run import Replayed
@@ -35,6 +35,7 @@ def page(prepared: Prepared, sections: list[Section], figures: dict[str, Any]) -
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
         f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n{_warnings(figures)}"
+        f'<p class="note"><strong>{escape(figures["verdict"]["line"])}</strong></p>\n'
         f'<p class="note">{escape(_summary(prepared, figures))}</p>\n{body}\n</body>\n</html>\n'
     )
 
@@ -45,7 +46,7 @@ def drawn_sections(
     """Tables and plots of a page, which is most of the work on it; tables only without the plotting library."""
     tables = [
         ("Errors", "In metres. Horizontal and whole errors of each drone's estimate of itself against the truth, per "
-         "part of the run; ANEES of the state of the fleet and of the own state: 1 is right, more is overconfident.",
+         f"part of the run. {ANEES_EXPLAINED[0].upper()}{ANEES_EXPLAINED[1:]}.",
          _table(*error_table(figures))),
         ("Fit", "Mean and largest of the normalised squared residuals of each drone's sensors and of the ranges to "
          "each neighbour, averaged over three seconds, a residual counting 10 at most: about 1 if a sensor is as "
@@ -62,7 +63,7 @@ def _plots(prepared: Prepared, replayed: Replayed, results: ReplayResults, figur
     config, inputs = prepared.config, prepared.inputs
     colours = {agent_id: colour(slot) for slot, agent_id in enumerate(config.ids) if agent_id in results.compared}
     series = [
-        replay_plots.Series(agent_id, compared.series, len(config.ids), inputs.plan.start_s, config.fleet.period_s)
+        replay_plots.Series(agent_id, compared.series, len(config.ids), inputs.plan.zero_s, config.fleet.period_s)
         for agent_id, compared in results.compared.items()
     ]  # fmt: skip
     span_s = figures["from_s"], figures["to_s"]
@@ -93,7 +94,7 @@ def _plots(prepared: Prepared, replayed: Replayed, results: ReplayResults, figur
         sections.append(
             ("Latency of GPS", "How much older a position is than its stamp: as known beforehand, then learned from "
              "manoeuvres; the band is 1-sigma.",
-             replay_plots.latency(latencies, inputs.plan.start_s, span_s, colours))
+             replay_plots.latency(latencies, inputs.plan.zero_s, span_s, colours))
         )  # fmt: skip
     sections += [
         ("Age of the news", "By drone: how old the newest measurement of each drone (its colour) is in its estimate.",

@@ -7,6 +7,11 @@ from typing import Any
 from fleetloc.report.replay_figures import ALL, SETTLED
 from fleetloc.run.replay_setup import NO_PLACE
 
+ANEES_EXPLAINED = (
+    "fleet ANEES: the squared error of all drones' positions and velocities, as this drone sees them, over what "
+    "it claims; own ANEES: of its own alone. 1 is right, above it the drone is too sure, below too cautious. A drone "
+    "may know itself well and claim too much of the others: then the two differ"
+)
 SPELLED = {SETTLED: "after 10 s"}
 MOSTLY = 0.9
 """Share of the estimates with a truth below which a reader is told."""
@@ -40,7 +45,7 @@ def log_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
 
 def error_table(figures: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Columns and rows: errors in m by agent and phase."""
-    columns = ["agent, phase", "RMSE", "horiz.", "median", "95 %", "ANEES", "own ANEES", "autopilot horiz.",
+    columns = ["agent, phase", "RMSE", "horiz.", "median", "95 %", "fleet ANEES", "own ANEES", "autopilot horiz.",
                "GPS as received", "to autopilot"]  # fmt: skip
     rows = []
     for agent in figures["agents"]:
@@ -103,6 +108,8 @@ def cautions(figures: dict[str, Any]) -> list[str]:
         if 0 < agent["ticks_with_truth"] < MOSTLY * estimated:
             known = f"{agent['ticks_with_truth']} of its {estimated} estimates"
             sentences.append(f"errors of drone {agent['id']} are of {known}: there is no truth for the others")
+    if figures["all_there_s"] is None:
+        sentences.append("the logs are never there all at once: times count from the start of the first")
     if figures["faults"]:
         kinds = ", ".join(fault["kind"] for fault in figures["faults"])
         sentences.append(f"faults were injected ({kinds}): this is not what the fleet flew")

@@ -6,6 +6,7 @@ Beside those of every run (`fleetloc.run.run_files`) and what is made of them fo
 ======================  ======================================================================================
 ``truth_001.track``     what they are compared with (`sim_bridge.replay.tracks`); likewise ``autopilot``, ``gps``
                         and ``gps_received`` (the same fixes at the times of their arrival)
+``ranges_001.track``    the ranges that agent 1 got
 ======================  ======================================================================================
 """
 
@@ -29,17 +30,18 @@ from agent.onboard import OnboardAgent
 from agent.outputs import EstimateReady
 from agent.sensing.samples import AutopilotEstimate, GpsSample
 from agent.watch.diagnostics import nis_gauges
+from agent.watch.tally import HealthTally
 from estimators.factory import make_estimator
 from fleetloc.output import progress_bar
-from fleetloc.report.replay_exports import MCAP
 from fleetloc.run import run_files
 from fleetloc.run.replay_setup import Prepared
 from sim_bridge.replay.engine import Replay, ReplayCounts
 from sim_bridge.replay.feed import Feed
 from sim_bridge.replay.logs.events import TruthSample
 from sim_bridge.replay.reading import read_beside
+from sim_bridge.replay.side_files.range_files import RangeLine
 from sim_bridge.replay.statistics import Thinned
-from sim_bridge.replay.tracks import TrackWriter
+from sim_bridge.replay.tracks import MeasuredRange, MeasuredWriter, TrackWriter, measured_path, track_path
 
 KINDS = ("truth", "autopilot", "gps", "gps_received")
 """References, each with a track per agent."""
@@ -48,7 +50,7 @@ LATENCY_EVERY_S = 1.0
 FIT_EVERY_S = 1.0
 RARE_COLLECTIONS = (100_000, 50, 100)
 """Thresholds of the collector while samples stream through: they leave no cycles, and looking for some is a tenth."""
-_OF_A_REPLAY = re.compile(rf"agent_[0-9]{{3}}\.csv|({'|'.join(KINDS)})_[0-9]{{3}}\.track|{re.escape(MCAP)}")
+_OF_A_REPLAY = re.compile(rf"agent_[0-9]{{3}}\.csv|({'|'.join(KINDS)}|ranges)_[0-9]{{3}}\.track")
 
 
 def refuse_inputs(directory: Path, inputs: Iterable[Path | str]) -> None:
@@ -64,11 +66,6 @@ def clear(directory: Path) -> None:
             path.unlink()
 
 
-def track_path(directory: Path, kind: str, agent_id: int) -> Path:
-    """The track of one kind of reference of one agent."""
-    return directory / f"{kind}_{agent_id:03d}.track"
-
-
 @dataclass(slots=True)
 class Replayed:
     """What a run leaves besides its files."""
@@ -80,6 +77,8 @@ class Replayed:
     """By agent: fleet time, latency of its GPS in s, 1-sigma; empty where it is not estimated."""
     fit: dict[int, FitTotals] = field(default_factory=dict)
     """By agent: how well its measurements fitted."""
+    said: dict[int, HealthTally] = field(default_factory=dict)
+    """By agent: what its health said."""
 
 
 @dataclass(slots=True)
@@ -142,9 +141,11 @@ class ReplayWriter:
     def __init__(self, directory: Path, config: FleetConfig, agents: Sequence[int]) -> None:
         self.latency: dict[int, Thinned] = {}
         self.fit = {agent_id: FitTotals() for agent_id in agents}
+        self.said = {agent_id: HealthTally() for agent_id in agents}
         self._fit_s: dict[int, float] = {}
         self._noted_s: dict[int, float] = {}
         self._recorders: dict[int, EstimateLogWriter] = {}
+        self._measured = {agent_id: MeasuredWriter(measured_path(directory, agent_id)) for agent_id in agents}
         for agent_id in agents:
             record = run_files.record_path(directory, agent_id)
             self._recorders[agent_id] = EstimateLogWriter(record, header_of(config, agent_id), sys.maxsize)
@@ -153,6 +154,7 @@ class ReplayWriter:
         """Write an estimate, and note now and then the latency, and how well the measurements fit."""
         agent_id = agent.agent_id
         self._recorders[agent_id].write(ready, ready.ready_s, 0.0)
+        self.said[agent_id].add(agent.core.health.health, ready.t_s)
         if ready.ready_s >= self._fit_s.get(agent_id, 0.0):
             self._fit_s[agent_id] = ready.ready_s + FIT_EVERY_S
             self.fit[agent_id].add(fit_of_ranges_and_fixes(agent))
@@ -164,10 +166,18 @@ class ReplayWriter:
             row = np.array((ready.ready_s, known.latency_s, known.sigma_s))
             self.latency.setdefault(agent_id, Thinned()).add(row)
 
+    def on_range(self, line: RangeLine) -> None:
+        """Write a range down that its observer got."""
+        measured = MeasuredRange(line.target, line.range_m, line.sigma_m)
+        self._measured[line.observer].write(line.time_s, measured)
+
     def close(self) -> None:
         """Close the records."""
-        for recorder in self._recorders.values():
-            recorder.close()
+        with ExitStack() as stack:
+            for recorder in self._recorders.values():
+                stack.callback(recorder.close)
+            for measured in self._measured.values():
+                stack.callback(measured.close)
 
 
 def run_replay(prepared: Prepared, directory: Path) -> Replayed:
@@ -176,7 +186,7 @@ def run_replay(prepared: Prepared, directory: Path) -> Replayed:
     agents = [vehicle.agent_id for vehicle in inputs.plan.vehicles]
     feed = Feed(inputs, ReferenceTracks(directory, agents))
     results = ReplayWriter(directory, config, agents)
-    replay = Replay(config, feed, make_estimator, results.on_estimate)
+    replay = Replay(config, feed, make_estimator, results.on_estimate, results.on_range)
     gc.collect()
     gc.freeze()  # full collections over all modules would take a tenth of the time
     usual = gc.get_threshold()
@@ -192,9 +202,8 @@ def run_replay(prepared: Prepared, directory: Path) -> Replayed:
         results.close()
         gc.set_threshold(*usual)
         gc.unfreeze()
-    return Replayed(
-        counts, time.monotonic() - began_s, time.process_time() - cpu_s, results.latency, results.fit
-    )
+    wall_s, used_s = time.monotonic() - began_s, time.process_time() - cpu_s
+    return Replayed(counts, wall_s, used_s, results.latency, results.fit, results.said)
 
 
 def fit_of_ranges_and_fixes(agent: OnboardAgent) -> dict[str, float]:

@@ -95,15 +95,12 @@ def prepare(options: Options) -> Prepared:
     files = _truth_files(options.truth, FleetFrame.of(config), sources)
     plan = make_plan(config, sources, _better_clocks(sources, files))
     config = _with_epoch(config, plan)
-    from_s, to_s = ReplaySpan(options.from_s, options.to_s).resolved(plan.start_s, plan.end_s)
-    from_s, to_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
-    if not from_s < to_s:
-        raise InputError("--from/--to", "", f"a part of {plan.end_s - plan.start_s:.1f} s", "nothing of it")
+    from_s, to_s = _part(options, plan)
     flown = tuple(vehicle.agent_id for vehicle in plan.vehicles)
     asked = [GpsDrop.parsed(text) for text in options.drops]
-    drops = GpsDrops(asked, flown, plan.start_s, plan.end_s, (from_s, to_s))
-    part_s = from_s - plan.start_s, to_s - plan.start_s
-    injection = Injection(parsed_faults(options.faults, config, flown, part_s), options.seed, plan.start_s)
+    drops = GpsDrops(asked, flown, *plan.span_s, (from_s, to_s))
+    part_s = from_s - plan.zero_s, to_s - plan.zero_s
+    injection = Injection(parsed_faults(options.faults, config, flown, part_s), options.seed, plan.zero_s)
     truth = {v.agent_id: _fleet_timed(v, files[_key(v)], plan) for v in plan.vehicles} if files else None
     counts = RangeCounts()
     ranges, ranges_from = _ranges(options, config, plan, counts)
@@ -129,6 +126,25 @@ def prepare(options: Options) -> Prepared:
         ranges_from=ranges_from,
         truth_files=truth_files,
     )
+
+
+def _part(options: Options, plan: ReplayPlan) -> tuple[float, float]:
+    """The fleet times between which is replayed; raises `InputError` if nothing is left."""
+    if plan.overlap_s is None and (options.from_s is not None or options.to_s is not None):
+        names = names_apart(vehicle.source.path for vehicle in plan.vehicles)
+        earliest = min(plan.vehicles, key=lambda each: each.last_s)
+        latest = max(plan.vehicles, key=lambda each: each.first_s)
+        apart = f"{names[earliest.source.path]} ends {latest.first_s - earliest.last_s:.1f} s before"
+        raise InputError("--from/--to", "", "logs that overlap", f"{apart} {names[latest.source.path]} begins")
+    from_s, to_s = ReplaySpan(options.from_s, options.to_s).resolved(*plan.span_s)
+    from_s, to_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
+    if not from_s < to_s:
+        found = f"nothing between {from_s - plan.zero_s:.1f} and {to_s - plan.zero_s:.1f} s"
+        begin_s, end_s = plan.start_s - plan.zero_s, plan.end_s - plan.zero_s
+        common_s = plan.span_s[1] - plan.zero_s
+        expected = f"a part of {begin_s:.1f} to {end_s:.1f} s (0 to {common_s:.1f} s are in all logs)"
+        raise InputError("--from/--to", "", expected, found)
+    return from_s, to_s
 
 
 # --- configuration and logs ----------------------------------------------------------------------------------

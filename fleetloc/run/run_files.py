@@ -13,6 +13,7 @@
 ``simulator.json``             how its run went (`sim_bridge.world.simulator.SimulatorReport`)
 ``report.json``                figures
 ``report.html``                the same for people, with plots
+``estimates.mcap``, ...        files for other tools, where they were asked for (`fleetloc.export`)
 =============================  ====================================================================
 """
 
@@ -34,6 +35,8 @@ from fleetloc.errors import InputError
 
 CONFIG, TRUTH, REPORT_JSON, REPORT_HTML = "fleet.toml", "truth.npz", "report.json", "report.html"
 SIMULATOR_LOG, SIMULATOR_JSON = "simulator.log", "simulator.json"
+MCAP, KML, GEOJSON, LAYOUT = "estimates.mcap", "tracks.kml", "tracks.geojson", "foxglove-layout.json"
+EXPORTED = (MCAP, KML, GEOJSON, LAYOUT)
 SUMMARY_SUFFIX = ".json"
 BESIDE_SUFFIXES = (SUMMARY_SUFFIX, ".tlog", ".mcap")
 """What goes with a record and keeps its number."""
@@ -131,7 +134,7 @@ def clear(directory: Path) -> None:
 
 def _left_in(directory: Path, also: re.Pattern[str] | None = None) -> Iterator[Path]:
     """The files in a folder whose names are those of a run."""
-    named = {CONFIG, TRUTH, REPORT_JSON, REPORT_HTML, SIMULATOR_LOG, SIMULATOR_JSON}
+    named = {CONFIG, TRUTH, REPORT_JSON, REPORT_HTML, SIMULATOR_LOG, SIMULATOR_JSON, *EXPORTED}
     for path in directory.iterdir() if directory.is_dir() else ():
         if path.name in named or _OF_A_RUN.fullmatch(path.name) or (also and also.fullmatch(path.name)):
             yield path

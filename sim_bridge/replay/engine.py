@@ -56,9 +56,16 @@ class Replay:
     """One replay; `run` does it."""
 
     def __init__(
-        self, config: FleetConfig, feed: Feed, make_estimator: EstimatorFactory, on_estimate: OnEstimate
+        self,
+        config: FleetConfig,
+        feed: Feed,
+        make_estimator: EstimatorFactory,
+        on_estimate: OnEstimate,
+        on_range: Callable[[RangeLine], None] = lambda _line: None,
     ) -> None:
+        """``on_estimate`` gets every estimate, ``on_range`` every range that an agent gets."""
         self._feed = feed
+        self._on_measured = on_range
         self._anchors = config.places_m
         self._inputs = inputs = feed.inputs
         self._queue = EventQueue(inputs.from_s)
@@ -157,6 +164,7 @@ class Replay:
         now_s = self._queue.now_s
         drone.agent.on_uwb_frame(frame, now_s - line.time_s, now_s)
         self._counts.ranges["delivered"] += 1
+        self._on_measured(line)
 
     def _finished(self, last_s: float) -> ReplayCounts:
         for agent_id, drone in self.drones.items():

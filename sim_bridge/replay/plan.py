@@ -63,6 +63,24 @@ class ReplayPlan:
         return max(vehicle.last_s for vehicle in self.vehicles)
 
 
+    @property
+    def overlap_s(self) -> tuple[float, float] | None:
+        """Fleet times between which all vehicles are there; ``None`` if there is no such time."""
+        from_s = max(vehicle.first_s for vehicle in self.vehicles)
+        to_s = min(vehicle.last_s for vehicle in self.vehicles)
+        return (from_s, to_s) if from_s < to_s else None
+
+    @property
+    def span_s(self) -> tuple[float, float]:
+        """Fleet times from which people count, and to which from the end: of the overlap, else of everything."""
+        return self.overlap_s or (self.start_s, self.end_s)
+
+    @property
+    def zero_s(self) -> float:
+        """Fleet time of the zero of all times that people give and get."""
+        return self.span_s[0]
+
+
 def make_plan(
     config: FleetConfig, sources: Sequence[LogSource], unix_zero_s: dict[int, float] | None = None
 ) -> ReplayPlan:

@@ -7,6 +7,8 @@ of hours needs no more memory than one of seconds: reading maps the file.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +19,7 @@ from agent.sensing.samples import Triple
 
 SUFFIX = ".track"
 ENTRY = np.dtype([("t_s", "<f8"), ("position_m", "<f8", 3), ("velocity_mps", "<f8", 3)])
+RANGE_ENTRY = np.dtype([("t_s", "<f8"), ("target", "<i4"), ("range_m", "<f8"), ("sigma_m", "<f8")])
 FLUSH_ENTRIES = 256
 UNKNOWN: Triple = (math.nan, math.nan, math.nan)
 """A velocity that the source does not give."""
@@ -55,6 +58,55 @@ class TrackWriter:
     def _flush(self) -> None:
         self._file.write(self._buffer[: self._held].tobytes())
         self._held = 0
+
+
+def track_path(directory: Path, kind: str, agent_id: int) -> Path:
+    """The track of one kind of reference of one agent."""
+    return directory / f"{kind}_{agent_id:03d}{SUFFIX}"
+
+
+def measured_path(directory: Path, agent_id: int) -> Path:
+    """The ranges that one agent measured."""
+    return track_path(directory, "ranges", agent_id)
+
+
+@dataclass(frozen=True, slots=True)
+class MeasuredRange:
+    """A range as its observer got it; ``sigma_m`` as the file or module claimed, ``None`` where it did not."""
+
+    target: int
+    range_m: float
+    sigma_m: float | None
+
+
+class MeasuredWriter:
+    """Appends the ranges that an agent measures."""
+
+    def __init__(self, path: Path) -> None:
+        """Make the file anew; raises `OSError` if that cannot be done."""
+        self._file = path.open("wb")
+
+    def write(self, t_s: float, measured: MeasuredRange) -> None:
+        """One range at fleet time ``t_s``."""
+        sigma_m = math.nan if measured.sigma_m is None else measured.sigma_m
+        entry = np.array([(t_s, measured.target, measured.range_m, sigma_m)], RANGE_ENTRY)
+        self._file.write(entry.tobytes())
+
+    def close(self) -> None:
+        """Write out what is held; may be called again."""
+        self._file.close()
+
+
+def read_measured(path: Path) -> Iterator[tuple[float, MeasuredRange]]:
+    """Fleet times and ranges of a file; none if it is not there."""
+    if not path.exists() or path.stat().st_size < RANGE_ENTRY.itemsize:
+        return
+    for entry in np.memmap(path, RANGE_ENTRY, "r"):
+        sigma_m = float(entry["sigma_m"])
+        yield (
+            float(entry["t_s"]),
+            MeasuredRange(int(entry["target"]), float(entry["range_m"]), None if math.isnan(sigma_m) else sigma_m),
+        )
 
 
 class WrittenTrack:

@@ -70,7 +70,7 @@ class GpsDrops:
         end_s: float,
         part_s: tuple[float, float] = (-math.inf, math.inf),
     ) -> None:
-        """``ids`` of the drones with a log, ``part_s`` of the logs' time that is replayed.
+        """``ids`` of the drones with a log; windows count from ``start_s`` and to ``end_s``, ``part_s`` is replayed.
 
         Raises `ReplayError` for another drone, and for a window without length in that part.
         """
@@ -80,7 +80,8 @@ class GpsDrops:
                 expected = f"a drone with a log ({', '.join(map(str, ids))})"
                 raise ReplayError(OPTION, expected, str(drop.agent_id))
             asked_s = drop.window.resolved(start_s, end_s)
-            first_s, last_s = max(start_s, part_s[0]), min(end_s, part_s[1])
+            first_s = part_s[0] if math.isfinite(part_s[0]) else start_s
+            last_s = part_s[1] if math.isfinite(part_s[1]) else end_s
             from_s, to_s = max(asked_s[0], first_s), min(asked_s[1], last_s)
             if not from_s < to_s:
                 expected = f"a part of what is replayed, {first_s - start_s:.1f} to {last_s - start_s:.1f} s"

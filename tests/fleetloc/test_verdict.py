@@ -30,6 +30,28 @@ def test_a_run_without_limits_passes_and_says_how_available_it_was() -> None:
     assert (found.line, found.failed) == ("passed: available 90.0 %", False)
 
 
+def test_alarms_doubts_and_what_was_not_used_are_said() -> None:
+    run = figures(mode="replay")
+    calm = {"alarm": {"ticks": 0}, "doubts": {}, "refusals": {}, "other": {"no_fix": {"ticks": 9}}}
+    for agent in run["agents"]:
+        agent |= {"said": calm, "refused": {}, "packets": {"rejected": {}}}
+    assert verdict(run, {}).line == "passed: available 90.0 %"
+    run["agents"][1] |= {
+        "said": {
+            "alarm": {"ticks": 12},
+            "doubts": {"one_plane": {"ticks": 3}, "ambiguous": {"ticks": 5}},
+            "refusals": {"receiver_off": {"ticks": 40}},
+            "other": {},
+        },
+        "refused": {"heard: impossible": 4},
+        "packets": {"rejected": {"replay": 3}},
+    }
+    assert verdict(run, {}).line == (
+        "passed: alarm of 2 in 12.0 %; doubts of 2 (ambiguous 5.0 %, one plane 3.0 %); "
+        "not used by 2 (receiver off 40.0 %, 7 item(s)); available 90.0 %"
+    )
+
+
 @pytest.mark.parametrize(
     ("required", "words"),
     [

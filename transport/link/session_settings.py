@@ -27,6 +27,9 @@ from transport.link.streams import (
 from transport.messages.header import MAX_PACKET_BYTES
 from transport.security.uwb_seal import UwbSeal
 
+STRANGERS = 60
+"""Sessions beside those of members: monitors, UWB drivers, and whoever else comes where links are open. Zenoh keeps
+no slot for anybody; where strangers have taken all, a new session shakes them off (`agent.radio.session_watch`)."""
 Milliseconds = Annotated[int, msgspec.Meta(ge=1, le=600_000)]
 Count = Annotated[int, msgspec.Meta(ge=1)]
 
@@ -108,7 +111,8 @@ def zenoh_config(
 
     Raises `SettingsError` where Zenoh refuses it.
     """
-    table = _table(settings, check_fleet_name(fleet))
+    members = tuple(members)
+    table = _table(settings, check_fleet_name(fleet), len(members) + STRANGERS)
     if settings.tls is not None:
         table["transport"]["link"]["protocols"] = list(SECURE_LINKS)
         table["transport"]["link"]["tls"] = _tls_table(settings.tls)
@@ -119,7 +123,7 @@ def zenoh_config(
         raise SettingsError(f"transport settings refused by Zenoh: {error}") from None
 
 
-def _table(settings: SessionSettings, fleet: str) -> dict[str, Any]:
+def _table(settings: SessionSettings, fleet: str, sessions: int) -> dict[str, Any]:
     s, largest = settings, 2 * MAX_PACKET_BYTES
     pauses = {"period_init_ms": s.retry_initial_ms, "period_max_ms": s.retry_max_ms}
     retry = {**pauses, "period_increase_factor": 2}
@@ -140,7 +144,7 @@ def _table(settings: SessionSettings, fleet: str) -> dict[str, Any]:
             "unicast": {
                 "open_timeout": s.open_timeout_ms,
                 "accept_timeout": s.open_timeout_ms,
-                "max_sessions": 64,
+                "max_sessions": sessions,
                 "max_links": 2 if s.multilink else 1,
             },
             "link": {

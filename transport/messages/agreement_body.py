@@ -1,7 +1,7 @@
 """What a fleet has to share, by the name of its setting: hashed into every packet, told in full where hashes differ.
 
-The body is JSON of names and values, and beside them who is heard twice. A value is told by its beginning and a hash if it is long, so that any two can
-be told from each other and the body fits into a datagram.
+The body is JSON of names and values, and beside them who is heard twice. A value is told by its beginning and a hash
+if it is long, so that any two can be told from each other and the body fits into a datagram.
 """
 
 from __future__ import annotations

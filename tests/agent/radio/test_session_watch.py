@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import json
 import threading
 import time
 from collections.abc import Callable
@@ -11,12 +12,15 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import zenoh
 
+from agent.config.tables import FleetConfig
 from agent.radio import radio as radio_module
 from agent.radio.radio import Listener, Radio
 from agent.radio.session_watch import LONGEST_PAUSE_HEARING_S, LONGEST_PAUSE_S, SILENT_S, SessionWatch
 from tests.support.awaiting import until
 from transport.link import session as session_module
+from transport.link import session_settings
 from transport.link.session import Handlers, Session, open_session
 from transport.link.session_settings import SessionSettings
 from transport.link.streams import Stream
@@ -90,6 +94,57 @@ async def test_a_radio_whose_neighbour_fell_silent_is_opened_anew_and_heard_agai
     finally:
         await neighbour.close()
         await radio.close()
+
+
+def idle_stranger(config: FleetConfig) -> zenoh.Session:
+    """A session that takes a slot, says nothing, and does not come back when it is thrown out."""
+    table = {
+        "mode": "peer",
+        "connect": {"endpoints": list(config.listen(1)), "retry": {"period_init_ms": 600_000}},
+        "listen": {"endpoints": []},
+        "scouting": {"multicast": {"enabled": False}, "gossip": {"enabled": False}},
+    }
+    return zenoh.open(zenoh.Config.from_json5(json.dumps(table)))
+
+
+async def test_strangers_who_take_all_slots_do_not_lock_a_member_out_for_good(
+    config_of: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # GIVEN a radio with four slots, of whose neighbour nothing is heard for long
+    monkeypatch.setattr(session_settings, "STRANGERS", 2)
+    monkeypatch.setattr(radio_module, "REDECLARE_AFTER_S", 0.05)
+    config, heard_s = config_of(2, "security.mode=unsigned"), [time.monotonic() + 1000.0]
+    listener = Listener(lambda *_: None, lambda *_: None, lambda *_: None, lambda *_: None, lambda _: heard_s[0])
+    radio, got = Radio(config, 1, Path(), listener), []
+    await radio.open()
+    strangers = [await asyncio.to_thread(idle_stranger, config) for _ in range(5)]
+    session = radio._session
+    assert session is not None
+    await until(lambda: session.connected() == 4, "strangers in all slots")
+    # WHEN it comes back, THEN there is no room for it
+    settings = SessionSettings(connect=config.listen(1))
+    handlers = Handlers(lambda *each: got.append(each))
+    neighbour = await open_session(settings, config.fleet.name, 2, config.ids, handlers)
+    try:
+        assert neighbour.connected() == 0
+        neighbour.subscribe(1, (Stream.MEAS,))
+        neighbour.announce()
+
+        def is_heard() -> bool:
+            radio.send([Packet(Stream.MEAS, b"hello")])
+            return bool(got)
+
+        assert not is_heard()
+        # UNTIL the radio looks for the neighbour that it misses
+        heard_s[0] = time.monotonic() - SILENT_S
+        monkeypatch.setattr(radio, "_opened_s", radio._opened_s - SILENT_S)
+        await until(is_heard, "the member in a slot")
+        heard_s[0] = time.monotonic() + 1000.0
+    finally:
+        await neighbour.close()
+        await radio.close()
+        for stranger in strangers:
+            await asyncio.to_thread(stranger.close)
 
 
 class Stuck:

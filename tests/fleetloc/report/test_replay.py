@@ -6,6 +6,7 @@ import csv
 import gzip
 import json
 import os
+import re
 from pathlib import Path
 from typing import Any
 
@@ -136,6 +137,72 @@ def test_times_count_from_the_start_of_the_logs_whatever_part_is_replayed(tmp_pa
     dropped = figures["agents"][1]["counters"]["skipped gps: dropped on request"]
     assert fixes[0] == fixes[1] + dropped > fixes[1] > 0 < dropped
     assert all(log["used"]["1"]["imu"] > 100 for log in figures["logs"])
+
+
+def without_first(log: bytes, seconds: float) -> bytes:
+    """A telemetry log less its first seconds."""
+    at, begin_us = 0, int.from_bytes(log[:8], "big")
+    while int.from_bytes(log[at : at + 8], "big") < begin_us + seconds * 1e6:
+        frame = log[at + 8 :]
+        at += 8 + {0xFD: 12, 0xFE: 8}[frame[0]] + frame[1] + (13 if frame[0] == 0xFD and frame[2] & 1 else 0)
+    return log[at:]
+
+
+def late_pair(folder: Path) -> tuple[Path, Path]:
+    """The same flight of two drones, of the second without its first 1.5 s."""
+    later = folder / "later.tlog"
+    later.write_bytes(without_first(gzip.decompress(COPTER.read_bytes()), 1.5))
+    return COPTER, later
+
+
+def test_times_count_from_where_all_logs_are_there(tmp_path: Path) -> None:
+    arguments = ["replay", pair_config(tmp_path), *late_pair(tmp_path), "--out", tmp_path / "out"]
+    part = ["--from", 1, "--to", 3, "--drop-gps", "1:2,9"]
+    assert main([str(argument) for argument in [*arguments, *part]]) == 0
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert (figures["from_s"], figures["to_s"]) == (1.0, pytest.approx(3.0, abs=0.1))
+    assert figures["gps_dropped"][0]["from_s"] == 2.0
+    assert all(19 <= agent["ticks_expected"] <= 22 for agent in figures["agents"])
+    # AND of the whole flight, what comes before has negative times
+    assert main([str(argument) for argument in arguments]) == 0
+    figures = json.loads((tmp_path / "out" / "report.json").read_text())
+    assert figures["from_s"] == pytest.approx(-1.5, abs=0.1)
+    assert 0.0 < figures["all_there_s"] < 10.0
+
+
+def test_a_part_of_which_nothing_is_left_is_refused_with_what_there_is(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs = late_pair(tmp_path)
+    code, _, err = run(capsys, "replay", pair_config(tmp_path), *logs, "--from", 40, "--out", tmp_path / "out")
+    assert code == 2
+    assert re.search(r"--from/--to: expected a part of -1\.\d to \d\.\d s \(0 to \d\.\d s are in all logs\)", err)
+
+
+def test_a_replay_ends_with_its_verdict(replayed: tuple[Path, dict[str, Any]]) -> None:
+    _, figures = replayed
+    assert figures["verdict"]["failed"] is False
+    assert figures["verdict"]["line"].startswith("passed: ")
+    assert figures["fleet"]["availability"] == pytest.approx(
+        1.0
+        - sum(agent["ticks_without_estimate"] for agent in figures["agents"])
+        / sum(agent["ticks_expected"] for agent in figures["agents"])
+    )
+    said = figures["agents"][1]["said"]
+    assert said["other"]["no_fix"]["ticks"] > 5  # its GPS is dropped at the end
+    assert said["alarm"]["ticks"] == figures["agents"][1]["ticks_alarm"]
+
+
+def test_a_limit_that_a_replay_does_not_keep_is_exit_1(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    single = CONFIGS / "single.toml"
+    code, out, _ = run(capsys, "replay", single, COPTER, "--out", tmp_path / "out", "--require", "rmse=0.001")
+    assert code == 1
+    assert "at most 0.001 required" in out.splitlines()[-2]
+    assert "fleet ANEES: " in out
+    assert "own ANEES: of its own alone" in (tmp_path / "out" / "report.html").read_text()
+    code, _, err = run(capsys, "replay", single, COPTER, "--out", tmp_path / "out", "--require", "speed=1")
+    assert code == 2
+    assert "--require: speed: expected one of" in err
 
 
 def test_a_fault_is_injected_told_and_judged_by_itself(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,6 +10,7 @@ import pytest
 
 from transport.errors import SettingsError
 from transport.link.session_settings import (
+    STRANGERS,
     SessionSettings,
     TlsSettings,
     access_control,
@@ -40,7 +41,7 @@ def test_peers_with_explicit_endpoints_and_nothing_that_scouts() -> None:
         "transport/link/tx/lease": 1500,
         "transport/unicast/open_timeout": 1500,
         "transport/unicast/max_links": 1,
-        "transport/unicast/max_sessions": 64,
+        "transport/unicast/max_sessions": 2 + STRANGERS,
         "adminspace/enabled": False,
         "adminspace/permissions/write": False,
     }.items():

@@ -1,6 +1,7 @@
 """Fleets under faults drawn from a seed, in virtual time, and what their history must keep whatever happens.
 
     python -m tests.fleet.nemesis --seeds 1..200 --out nemesis.jsonl
+    python -m tests.fleet.nemesis --live udp --seeds 1..15 --out nemesis_udp.jsonl
 
 One line a seed; seeds that the file has already are not flown again. A seed gives the same flight bit by bit.
 """
@@ -60,13 +61,15 @@ Kind = Literal[
     "silent_autopilot",
     "replay",
 ]
+LiveKind = Literal["both_stop", "full_disk"]
+"""Struck on live fleets only, with some of the others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Blow:
     """One fault: what, to whom, when; ``value`` is a share, a delay or a step, ``of`` who is not heard."""
 
-    kind: Kind
+    kind: Kind | LiveKind
     agent: int
     from_s: float
     to_s: float
@@ -287,11 +290,18 @@ def seeds_of(text: str) -> range:
     return range(int(first), int(last or first) + 1)
 
 
+def _fly_live(seed: int, link: str) -> Outcome:
+    from tests.fleet.nemesis_live import fly_live
+
+    return fly_live(seed, link)
+
+
 def main(arguments: Iterable[str]) -> int:
     """Fly seeds; the exit code is 1 if any broke something."""
     parser = argparse.ArgumentParser(prog="python -m tests.fleet.nemesis")
     parser.add_argument("--seeds", type=seeds_of, required=True, help="A..B")
     parser.add_argument("--out", type=Path, help="keeps the outcomes, and goes on from there")
+    parser.add_argument("--live", choices=("udp", "tcp"), help="a fleet of processes, linked so; one file for each")
     options = parser.parse_args(list(arguments))
     done: dict[int, bool] = {}
     if options.out is not None and options.out.exists():
@@ -300,7 +310,7 @@ def main(arguments: Iterable[str]) -> int:
     for seed in options.seeds:
         if seed in done:
             continue
-        found = Flight(seed).judged()
+        found = Flight(seed).judged() if options.live is None else _fly_live(seed, options.live)
         done[seed] = bool(found.broken)
         kinds = ", ".join(f"{blow['kind']} {blow['agent']}" for blow in found.blows)
         typer.echo(f"{seed}: {'; '.join(found.broken) or 'ok'} ({kinds}; RMSE {found.rmse_m:.3f} m)")

@@ -17,6 +17,7 @@ from agent.watch.health import State
 from estimators.estimator import Status
 from estimators.factory import make_estimator
 from estimators.model.layout import block, position
+from fleetloc.bench.fault_rows import RadioSpell
 from sim_bridge.faults.fault_tables import FaultTable
 from sim_bridge.virtual.fleet_lockstep import FleetLockstep, LockstepReport
 from sim_bridge.world.sim_table import sim_table
@@ -35,6 +36,7 @@ class Flight:
     seed: int
     faults: tuple[FaultTable, ...]
     duration_s: float
+    radio: RadioSpell | None = None
 
     def configured(self) -> FleetConfig:
         """The configuration of this flight."""
@@ -42,6 +44,8 @@ class Flight:
         sim = sim_table(config)
         sim = msgspec.structs.replace(sim, seed=self.seed, faults=(*sim.faults, *self.faults))
         transport = msgspec.structs.replace(config.transport, seed=self.seed)
+        if self.radio is not None:
+            transport = self.radio.laid_over(transport)
         return with_other_table(msgspec.structs.replace(config, transport=transport), "sim", sim)
 
 

@@ -12,12 +12,36 @@ from typing import Annotated, Any
 
 import msgspec
 
-from agent.config.fields import NotNegative, Table
+from agent.config.fields import Fraction, NotNegative, Table
 from agent.config.structs import read_struct
+from agent.config.tables import TransportTable
+from agent.radio.radio_faults import RadioOutage
 from fleetloc.errors import InputError
 from sim_bridge.faults.fault_tables import FaultTable, UwbWrong
 
 ROWS_FILE = Path(__file__).with_name("fault_rows.toml")
+
+
+class RadioSpell(Table, frozen=True, kw_only=True):
+    """What the radio does to packets: loss, delay and copies from the begin of the flight on, cuts in their time."""
+
+    from_s: NotNegative
+    """From here on, to ``to_s``, the row is looked at."""
+    to_s: NotNegative
+    loss: Fraction = 0.0
+    delay_s: NotNegative = 0.0
+    duplicate: Fraction = 0.0
+    outages: tuple[RadioOutage, ...] = ()
+    """As in ``[transport.faults]``, but with places in the fleet's file."""
+
+    def laid_over(self, transport: TransportTable) -> TransportTable:
+        """The settings of a fleet's radio with it."""
+        replaced = msgspec.structs.replace
+        outages = (*transport.faults.outages, *self.outages)
+        duplicate = max(self.duplicate, transport.faults.duplicate)
+        faults = replaced(transport.faults, duplicate=duplicate, outages=outages)
+        loss, delay_s = max(self.loss, transport.loss), max(self.delay_s, transport.delay_s)
+        return replaced(transport, loss=loss, delay_s=delay_s, faults=faults)
 
 
 class FaultRow(Table, frozen=True):
@@ -27,8 +51,10 @@ class FaultRow(Table, frozen=True):
     """One word, for ``--rows``."""
     title: str
     """What happens, in a line."""
-    faults: Annotated[tuple[FaultTable, ...], msgspec.Meta(min_length=1)]
+    faults: tuple[FaultTable, ...] = ()
     """All with an end: what comes after it is looked at too."""
+    radio: RadioSpell | None = None
+    """What happens to packets, in place of faults of drones or besides."""
     after_s: NotNegative = 20.0
     """How long the flight goes on after the last fault."""
     smallest_fleet: int = 1
@@ -47,12 +73,16 @@ class FaultRow(Table, frozen=True):
     @property
     def begin_s(self) -> float:
         """When the first fault begins."""
-        return min(fault.from_s for fault in self.faults)
+        return min(each.from_s for each in (*self.faults, *self._spells))
 
     @property
     def end_s(self) -> float:
         """When the last fault ends."""
-        return max(fault.end_s for fault in self.faults)
+        return max([*(fault.end_s for fault in self.faults), *(spell.to_s for spell in self._spells)])
+
+    @property
+    def _spells(self) -> tuple[RadioSpell, ...]:
+        return () if self.radio is None else (self.radio,)
 
     @property
     def duration_s(self) -> float:
@@ -63,9 +93,10 @@ class FaultRow(Table, frozen=True):
         """The row with a fleet's ids in place of places; ``None`` if it makes no sense for that fleet."""
         found = [_placed(fault, ids) for fault in self.faults]
         faults = tuple(fault for fault in found if fault is not None)
-        if not faults or len(ids) < self.smallest_fleet:
+        if (not faults and self.radio is None) or len(ids) < self.smallest_fleet:
             return None
-        return msgspec.structs.replace(self, faults=faults)
+        radio = None if self.radio is None else _radio_placed(self.radio, ids)
+        return msgspec.structs.replace(self, faults=faults, radio=radio)
 
 
 class _Rows(Table, frozen=True):
@@ -82,6 +113,19 @@ def _placed(fault: FaultTable, ids: Sequence[int]) -> FaultTable | None:
     return msgspec.structs.replace(fault, agents=agents, pairs=pairs) if agents or pairs or not named else None
 
 
+def _radio_placed(radio: RadioSpell, ids: Sequence[int]) -> RadioSpell:
+    """With ids in place of places, those that are not there left out."""
+    outages = tuple(
+        msgspec.structs.replace(
+            outage,
+            receivers=tuple(ids[place - 1] for place in outage.receivers if place <= len(ids)),
+            senders=tuple(ids[place - 1] for place in outage.senders if place <= len(ids)),
+        )
+        for outage in radio.outages
+    )
+    return msgspec.structs.replace(radio, outages=outages)
+
+
 def read_rows(path: Path) -> tuple[FaultRow, ...]:
     """The rows of a file; raises `InputError`, `OSError`."""
     try:
@@ -92,6 +136,11 @@ def read_rows(path: Path) -> tuple[FaultRow, ...]:
     if table is None:
         raise InputError(str(path), wrong[0].key, wrong[0].expected, wrong[0].found)
     for index, row in enumerate(table.rows):
+        if not row.faults and row.radio is None:
+            raise InputError(str(path), f"rows[{index}]", "faults or a radio", "neither")
+        if row.radio is not None and row.radio.to_s <= row.radio.from_s:
+            expected = f"later than from_s = {row.radio.from_s:g}"
+            raise InputError(str(path), f"rows[{index}].radio.to_s", expected, f"{row.radio.to_s:g}")
         for number, fault in enumerate(row.faults):
             if fault.to_s is None or fault.to_s <= fault.from_s:
                 key = f"rows[{index}].faults[{number}].to_s"

@@ -45,7 +45,7 @@ def faults(config: FleetConfig, rows: Sequence[FaultRow], *, runs: int, seed: in
     seeds = range(seed, seed + runs)
     longest_s = max(row.duration_s for _, row in placed)
     flights = [Flight(config, each, (), longest_s) for each in seeds]
-    flights += [Flight(config, each, row.faults, row.duration_s) for _, row in placed for each in seeds]
+    flights += [Flight(config, each, row.faults, row.duration_s, row.radio) for _, row in placed for each in seeds]
     histories = []
     with Hangar(min(jobs, len(flights))) as hangar, progress_bar("flights", len(flights)) as advance:
         for history in hangar.map(fly, flights):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -137,14 +138,14 @@ def _part(options: Options, plan: ReplayPlan) -> tuple[float, float]:
         apart = f"{names[earliest.source.path]} ends {latest.first_s - earliest.last_s:.1f} s before"
         raise InputError("--from/--to", "", "logs that overlap", f"{apart} {names[latest.source.path]} begins")
     from_s, to_s = ReplaySpan(options.from_s, options.to_s).resolved(*plan.span_s)
-    from_s, to_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
-    if not from_s < to_s:
-        found = f"nothing between {from_s - plan.zero_s:.1f} and {to_s - plan.zero_s:.1f} s"
-        begin_s, end_s = plan.start_s - plan.zero_s, plan.end_s - plan.zero_s
-        common_s = plan.span_s[1] - plan.zero_s
-        expected = f"a part of {begin_s:.1f} to {end_s:.1f} s (0 to {common_s:.1f} s are in all logs)"
-        raise InputError("--from/--to", "", expected, found)
-    return from_s, to_s
+    begin_s, end_s = max(from_s, plan.start_s), min(to_s, plan.end_s)
+    if not begin_s < end_s:
+        first_s, last_s, common_s = (each - plan.zero_s for each in (plan.start_s, plan.end_s, plan.span_s[1]))
+        whole = f"{round(first_s, 1) + 0.0:.1f} to {last_s:.1f} s"
+        expected = f"a part of {whole} (0 to {common_s:.1f} s are in all logs)"
+        asked = [f"{each - plan.zero_s:.1f} s" if math.isfinite(each) else "its end" for each in (from_s, to_s)]
+        raise InputError("--from/--to", "", expected, f"{asked[0].replace('its end', 'the begin')} to {asked[1]}")
+    return begin_s, end_s
 
 
 # --- configuration and logs ----------------------------------------------------------------------------------

@@ -11,9 +11,10 @@ import numpy as np
 import pytest
 
 from agent.config.reading import load_config
+from agent.radio.radio_faults import RadioOutage
 from fleetloc import cli
-from fleetloc.bench.fault_flights import History
-from fleetloc.bench.fault_rows import ROWS_FILE, FaultRow, chosen_rows, read_rows
+from fleetloc.bench.fault_flights import Flight, History
+from fleetloc.bench.fault_rows import ROWS_FILE, FaultRow, RadioSpell, chosen_rows, read_rows
 from fleetloc.bench.faults import Pooled, back_after_s, row_figures
 from fleetloc.errors import InputError
 from sim_bridge.faults.fault_tables import FaultTable, GpsOff, GpsWrong, UwbWrong, about, wrong_settings
@@ -58,6 +59,28 @@ def test_agents_of_a_row_are_places_in_the_fleet() -> None:
     assert msgspec.structs.replace(row, faults=row.faults[1:2]).placed((10, 20, 30)) is None
 
 
+def test_what_a_row_does_to_the_radio_comes_on_top_of_the_fleets_own() -> None:
+    radio = RadioSpell(
+        from_s=5.0,
+        to_s=8.0,
+        loss=0.3,
+        duplicate=0.5,
+        outages=(RadioOutage(from_s=5.0, to_s=8.0, receivers=(2,), senders=(1, 9)),),
+    )
+    row = FaultRow(name="x", title="x", radio=radio, after_s=2.0)
+    assert (row.begin_s, row.end_s, row.duration_s) == (5.0, 8.0, 10.0)
+    placed = row.placed((10, 20, 30))
+    assert placed is not None
+    assert placed.radio is not None
+    config = load_config(CONFIGS / "line3.toml", ["transport.loss=0.1", "transport.delay_s=0.02"])
+    transport = Flight(config, 4, (), row.duration_s, placed.radio).configured().transport
+    assert (transport.loss, transport.delay_s, transport.seed) == (0.3, 0.02, 4)
+    assert transport.faults.duplicate == 0.5
+    (outage,) = transport.faults.outages
+    assert (outage.receivers, outage.senders) == ((20,), (10,))
+    assert Flight(config, 4, (), row.duration_s).configured().transport.loss == 0.1
+
+
 def test_rows_are_chosen_by_name() -> None:
     rows = read_rows(ROWS_FILE)
     assert chosen_rows(rows, "") == rows
@@ -70,7 +93,11 @@ def test_rows_are_chosen_by_name() -> None:
     ("text", "words"),
     [
         ("rows = 3", "rows: expected an array of tables, found 3"),
-        ("[[rows]]\nname = 'a'\ntitle = 'a'\nfaults = []", r"rows\[0\].faults: expected"),
+        ("[[rows]]\nname = 'a'\ntitle = 'a'\nfaults = []", r"rows\[0\]: expected faults or a radio, found neither"),
+        (
+            "[[rows]]\nname = 'a'\ntitle = 'a'\nradio = {from_s = 3.0, to_s = 2.0}",
+            r"rows\[0\].radio.to_s: expected later than from_s = 3, found 2",
+        ),
         ("[[rows]]\nname = 'a'\ntitle = 'a'\nfaults = [{kind = 'gps_of'}]", "one of gps_off, .*, found 'gps_of'"),
         (
             "[[rows]]\nname = 'a'\ntitle = 'a'\nfaults = [{kind = 'gps_off', agents = [1]}]",

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -70,6 +70,8 @@ class FedVehicle:
     system_id: int = 1
     judged: Callable[[float], IntegrityState] = lambda _at_s: IntegrityState.NOMINAL
     off_m: Callable[[float], Sequence[float]] = lambda _at_s: (0.0, 0.0, 0.0)
+    fixes_off_m: Callable[[float], float | None] = lambda _at_s: None
+    """By how much integrity finds its own fixes to be off at a time."""
     spoil: Callable[[Message, float], Message | None] = lambda message, _at_s: message
     alive: Callable[[float], bool] = lambda _at_s: True
     heard: Callable[[Message], Message] = lambda message: message
@@ -194,7 +196,7 @@ class FedVehicle:
         _, position, velocity = min(self._truth[-60:], key=lambda each: abs(each[0] - t_s))
         noise = self._rng.normal(0.0, 0.1, 6)
         mean = np.concatenate((position + noise[:3] + self.off_m(now_s), velocity + noise[3:]))
-        state = self.judged(now_s)
+        state, off_m = self.judged(now_s), self.fixes_off_m(now_s)
         level = ProtectionLevel(3.7 * self.sigma_m, 3.3 * self.sigma_m)
         host_s = START_S + t_s
         ahead_s = 0.0 if self.session.reads_stamps else self.age_s
@@ -206,7 +208,7 @@ class FedVehicle:
             mean,
             np.eye(6) * self.sigma_m**2,
             Status.OK,
-            statement(state, level, 0.6),
+            replace(statement(state, level, 0.6), off={} if off_m is None else {1: off_m}),
             self._quaternion,
             None if stamp_s is None or stamp_s < 0 else round(stamp_s * 1e6),
             self.session.samples.without_fix or now_s - self._fix_s > LOST_AFTER_S,

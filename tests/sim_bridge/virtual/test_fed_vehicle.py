@@ -15,7 +15,7 @@ from agent.feedback.gatekeeper import FeedPhase
 from agent.mavlink.codec import Message, mavlink
 from estimators.integrity.protection.statement import IntegrityState
 from sim_bridge.autopilot.flavours import FlightMode
-from sim_bridge.faults.fault_tables import GpsWrong
+from sim_bridge.faults.fault_tables import GpsDrift, GpsWrong
 from tests.support.fed_vehicle import FedVehicle, with_fields
 
 LOST_S, BACK_S = 12.0, 30.0
@@ -163,6 +163,31 @@ def test_a_gps_that_returns_300_m_off_is_said_and_does_not_win_while_the_feed_is
     assert flight.first_said("GPS_BACK_WRONG") < 20.0 + 2.0
     assert flight.phases(21.0, 32.0) == {FeedPhase.FEEDING}
     assert flight.errors_m(20.0, 32.0).max() < 3.0
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_an_ardupilot_that_is_told_of_its_spoofed_receiver_flies_on_the_estimate(told: bool) -> None:
+    spoofed_s, named_s, end_s = 12.0, 17.0, 40.0
+    drift = GpsDrift(agents=(1,), from_s=spoofed_s, rate_mps=(0.6, 0.0, 0.0))
+    flight = FedVehicle(
+        "ardupilot",
+        outage_s=(900.0, 901.0),
+        faults=(drift,),
+        feedback={"tell_spoofing": told},
+        judged=lambda at_s: IntegrityState.DEGRADED if at_s > named_s else IntegrityState.NOMINAL,
+        fixes_off_m=lambda at_s: 0.6 * (at_s - spoofed_s) if at_s > named_s else None,
+    )
+    flight.autopilot.state.hears_of_spoofing = True
+    flight.fly(end_s)
+
+    error_m = flight.errors_m(end_s - 10.0, end_s)
+    if told:
+        assert flight.phases(named_s + 3.0, end_s) == {FeedPhase.FEEDING}
+        assert error_m.max() < 1.5
+    else:
+        assert FeedPhase.FEEDING not in flight.phases(0.0, end_s)
+        assert error_m.min() > 5.0  # it follows its receiver, as without us
+    assert {n.mode for n in flight.noted} == {FlightMode.MISSION}
 
 
 def test_an_origin_that_is_not_the_autopilots_is_never_fed() -> None:

@@ -38,13 +38,9 @@ class Said:
             self.about.add(about)
 
     def figures(self, zero_s: float) -> dict[str, Any]:
-        """For ``report.json``, times from ``zero_s`` on; ``about`` are ids of other drones."""
-        return {
-            "ticks": self.ticks,
-            "first_s": self.first_s - zero_s,
-            "last_s": self.last_s - zero_s,
-            "about": sorted(self.about),
-        }
+        """For ``report.json``, times from ``zero_s`` on (``None``: never); ``about`` are ids of other drones."""
+        first_s, last_s = (self.first_s - zero_s, self.last_s - zero_s) if self.ticks else (None, None)
+        return {"ticks": self.ticks, "first_s": first_s, "last_s": last_s, "about": sorted(self.about)}
 
 
 class HealthTally:

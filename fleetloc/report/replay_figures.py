@@ -21,6 +21,8 @@ from sim_bridge.replay.tracks import WrittenTrack, track_path
 
 SETTLED_S = 10.0
 """Figures are also given from here on after an agent's first estimate, when its start is forgotten."""
+USELESS = ("not located", "beyond the joint state", "heard: not used", "heard: too old")
+"""Measurements that are left out although nothing is wrong with them."""
 ALL, SETTLED = "all", "after_10s"
 
 
@@ -138,8 +140,14 @@ def _pooled(agents: list[dict[str, Any]]) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _refused(name: str) -> bool:
-    """Whether a counter is of something that came and was not believed."""
+def _refused(counters: Mapping[str, int]) -> dict[str, int]:
+    return {name.removeprefix("refused "): n for name, n in sorted(counters.items()) if is_refusal(name) and n}
+
+
+def is_refusal(name: str) -> bool:
+    """Whether a counter is of something that came and was not believed; what is late or of no use is not among it."""
+    if name.removeprefix("refused ") in USELESS:
+        return False
     return name.startswith(("refused ", "impossible ")) or name.endswith(": refused") or ": refused of" in name
 
 
@@ -178,7 +186,7 @@ def _of_agent(prepared: Prepared, replayed: Replayed, results: ReplayResults, ag
         },
         "ticks_alarm": counters["ticks: alarm"],
         "said": replayed.said[agent_id].figures(plan.zero_s),
-        "refused": {name.removeprefix("refused "): n for name, n in sorted(counters.items()) if _refused(name) and n},
+        "refused": _refused(counters),
         "integrity": of_integrity(counters),
         "fit": replayed.fit[agent_id].figures(),
         "packets": counted_packets(counters),

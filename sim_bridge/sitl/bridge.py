@@ -17,7 +17,7 @@ from agent.config.tables import FleetConfig
 from sim_bridge.sitl.session import TimedTruth
 from sim_bridge.sitl.setup import vehicle_links
 from sim_bridge.sitl.sitl_table import sitl_table
-from sim_bridge.sitl.vehicle import SitlVehicle, VehicleReport
+from sim_bridge.sitl.vehicle import NOBODY, SitlVehicle, VehicleReport
 from sim_bridge.sitl.world import SitlWorld
 from sim_bridge.world.range_sessions import open_range_sessions
 from sim_bridge.world.sim_table import GpsOutage, sim_table
@@ -161,7 +161,9 @@ class SitlBridge:
                 return
             if now_s > deadline_s:
                 limit_s = self._sitl.appear_timeout_s
-                raise SimulatorAbsent(f"{'; '.join(missing)}; waited {limit_s:g} s: is it running there?")
+                nobody = any(line.endswith(NOBODY) for line in missing)
+                doubt = ": is it running there?" if nobody else ""
+                raise SimulatorAbsent(f"{'; '.join(missing)}; waited {limit_s:g} s{doubt}")
             if now_s - told_s >= PROGRESS_S:
                 told_s = now_s
                 on_progress(BridgeProgress(missing))

@@ -19,6 +19,8 @@ from sim_bridge.sitl.setup import LOCAL_HOST, VehicleLinks
 GPS_MESSAGES = frozenset({mavlink.MAVLINK_MSG_ID_GPS_RAW_INT, mavlink.MAVLINK_MSG_ID_GPS2_RAW})
 """What a daemon does not get while its GPS is out; the autopilot itself keeps it, and flies on."""
 
+NOBODY = "nobody there"
+
 
 @dataclass(frozen=True, slots=True)
 class VehicleReport:
@@ -109,7 +111,7 @@ class SitlVehicle:
         if self._received_bytes:
             heard = describe(session.ignored)
             return f"{self.links.name}: expected heartbeats of system id {self._system}, heard {heard}"
-        return f"{self.links.name}: {'connected, but silent' if self._link.peer else 'nobody there'}"
+        return f"{self.links.name}: {'connected, but silent' if self._link.peer else NOBODY}"
 
     def _on_simulator(self, data: bytes) -> bool:
         now_s = time.monotonic()

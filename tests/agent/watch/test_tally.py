@@ -27,5 +27,9 @@ def test_alarms_doubts_refusals_and_the_rest_are_counted_with_their_times() -> N
     }
 
 
+def test_what_was_never_said_has_no_time() -> None:
+    assert HealthTally().figures(90.0)["alarm"] == {"ticks": 0, "first_s": None, "last_s": None, "about": []}
+
+
 def test_nothing_is_a_doubt_and_a_refusal() -> None:
     assert not DOUBTS & REFUSALS

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from fleetloc.report.replay_figures import is_refusal
 from fleetloc.report.replay_tables import error_table
 
 FIGURES = (
@@ -40,3 +41,20 @@ def lines(**ticks: int) -> list[str]:
 )
 def test_each_part_of_a_run_that_says_something_has_a_line(ticks: dict[str, int], shown: list[str]) -> None:
     assert lines(**ticks) == shown
+
+
+@pytest.mark.parametrize(
+    ("counter", "counts"),
+    [
+        ("refused heard: not proven, of 3", True),
+        ("refused own: out of range", True),
+        ("impossible rows of 2", True),
+        ("gps: refused", True),
+        ("information: refused of 2", True),
+        ("refused not located", False),
+        ("refused heard: too old", False),
+        ("gps: late", False),
+    ],
+)
+def test_only_what_was_not_believed_counts_as_refused(counter: str, counts: bool) -> None:
+    assert is_refusal(counter) is counts

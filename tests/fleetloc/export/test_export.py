@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shutil
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
 from typing import Any
@@ -14,16 +15,19 @@ from mcap.reader import make_reader
 from agent.config.reading import load_config
 from agent.config.tables import FleetConfig
 from agent.log.estimate_log import EstimateLogWriter, header_of
+from agent.log.flight_reader import FlightReader
 from agent.outputs import EstimateReady
 from agent.sensing.frames import FleetFrame
 from estimators.estimator import Estimate, SolverReport, Status
 from fleetloc import cli
+from fleetloc.export.flown import export_run
 from fleetloc.export.map_files import MapTrack, write_geojson, write_kml
 from fleetloc.export.plot_files import EVERY_S, PlotFiles
 from fleetloc.run import run_files
 from transport.messages.estimate_body import MAX_AGE_TICKS
 
 LINE3 = Path(__file__).parents[3] / "configs" / "line3.toml"
+RECORDS = Path(__file__).parents[2] / "data" / "records"
 KML_NS = {"k": "http://www.opengis.net/kml/2.2", "gx": "http://www.google.com/kml/ext/2.2"}
 COVARIANCE = np.array([[4.0, 0.1, 0.2], [0.1, 9.0, 0.3], [0.2, 0.3, 16.0]])
 
@@ -207,3 +211,22 @@ def test_the_command_reads_the_folder_of_a_run(
     assert len(found["/agent_001/sees/agent_002"]) == 15
     assert cli.main(["export", str(LINE3), str(tmp_path / "made")]) == 2
     assert "agent_001.estimates, as a run leaves it" in capsys.readouterr().err
+
+
+def test_fixes_and_ranges_of_a_run_come_from_its_flight_log(tmp_path: Path) -> None:
+    for suffix in (".mcap", ".tlog"):
+        shutil.copy((RECORDS / "two_places_002").with_suffix(suffix), (tmp_path / "agent_002").with_suffix(suffix))
+    (tmp_path / run_files.CONFIG).write_text(FlightReader(tmp_path / "agent_002.mcap").start.config)
+    config = load_config(tmp_path / run_files.CONFIG)
+    EstimateLogWriter(run_files.record_path(tmp_path, 2), header_of(config, 2), 10**9).close()
+    assert export_run(config, tmp_path, tmp_path) == []
+    found = messages(tmp_path / run_files.MCAP)
+    ranges = {topic: content for topic, content in found.items() if "/range/" in topic}
+    assert set(ranges) == {"/agent_002/range/agent_001", "/agent_002/range/agent_003"}
+    assert sum(map(len, ranges.values())) == 80
+    firsts = [content[0]["range_m"] for _, content in sorted(ranges.items())]
+    assert firsts == pytest.approx([28.316, 24.771], abs=1e-3)
+    fixes = found["/agent_002/gps_ned"]
+    assert len(fixes) == len(found["/agent_002/gps"]) == 40
+    assert [fixes[0][name] for name in ("n_m", "e_m", "d_m")] == pytest.approx([-11.930, 9.180, -5.190], abs=1e-3)
+    assert '"drone 2, gps"' in (tmp_path / run_files.GEOJSON).read_text()

@@ -217,7 +217,8 @@ class AmbiguityMonitor:
     def _advance(self, mixture: Mixture, evidence: DroneEvidence) -> None:
         """Move to this tick and use its rows other than ranges."""
         rows = evidence.rows
-        linear = rows[np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.HEIGHT))]
+        kind = rows["kind"]
+        linear = rows[(kind == Kind.POSITION) | (kind == Kind.VELOCITY) | (kind == Kind.HEIGHT)]
         before, self._drift = self._drift, evidence.drift
         predict(mixture, evidence.accel, evidence.accel_variance, self._period_s, evidence.drift)
         if before is not None and evidence.drift is not None:  # an attitude that tilts does so at once

@@ -13,11 +13,12 @@ have to be differs from place to place, and white noise of its size would tell p
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 
 from estimators.compiled.entries import entry, kernel
-from estimators.compiled.linear_algebra import cholesky_upper, solve_upper_transposed
+from estimators.compiled.linear_algebra import cholesky_upper
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.motion import input_matrix, transition_matrix
 from estimators.model.row_kernels import IntArray
@@ -32,6 +33,8 @@ MOST = 128
 """Components at most: nothing is split beyond it."""
 SPLIT_SHIFT = 1.5
 """How far, in sigma, the outer two of three parts are moved; each is half as wide, their weights 1/6, 2/3, 1/6."""
+NEAREST_M = 1e-6
+"""Distance at least: at none a range has no direction."""
 LEANING = 1e-3
 """Preference among axes along which a component is equally wide: which one is taken must not depend on north."""
 
@@ -97,16 +100,22 @@ def predict(
 
     ``drift``: how its error goes on, where that is a state.
     """
-    kinematic = input_matrix(1, period_s)
+    move, kinematic = _kinematics(period_s)
     if drift is None:
-        transition, push, noise = transition_matrix(1, period_s), kinematic, np.zeros((6, 6))
+        transition, push, noise = move, kinematic, np.zeros((6, 6))
     else:
         transition, push, noise = drift.kept * np.eye(9), np.zeros((9, 3)), np.zeros((9, 9))
-        transition[:6, :6], transition[:6, 6:], push[:6] = transition_matrix(1, period_s), -kinematic, kinematic
+        transition[:6, :6], transition[:6, 6:], push[:6] = move, -kinematic, kinematic
         noise[range(6, 9), range(6, 9)] = (1.0 - drift.kept**2) * drift.size_mps2**2
     mixture.means = mixture.means @ transition.T + push @ accel
     noise += (push * accel_variance) @ push.T
     mixture.covariances = transition @ mixture.covariances @ transition.T + noise
+
+
+@cache
+def _kinematics(period_s: float) -> tuple[Matrix, Matrix]:
+    """Transition ``(6, 6)`` and input matrix ``(6, 3)`` of one agent; they are not to be changed."""
+    return transition_matrix(1, period_s), input_matrix(1, period_s)
 
 
 def correct_linear(mixture: Mixture, slope: Vector, value: float, variance: float) -> None:
@@ -124,22 +133,69 @@ def correct_range(
 
     Second order: the mean and the variance of what the linearisation misses are in the innovation.
     """
-    lever = np.array([1.0, 1.0, 1.0, offset_s, offset_s, offset_s])
-    means, spread = mixture.means[:, :6] * lever, mixture.covariances[:, :6, :6] * np.outer(lever, lever)
-    there, there_spread = place * lever, place_covariance * np.outer(lever, lever)
-    own = spread[:, :3, :3] + spread[:, 3:, :3] + spread[:, :3, 3:] + spread[:, 3:, 3:]
-    other = there_spread[:3, :3] + there_spread[3:, :3] + there_spread[:3, 3:] + there_spread[3:, 3:]
-    away = means[:, :3] + means[:, 3:] - there[:3] - there[3:]
-    distance = np.maximum(np.linalg.norm(away, axis=-1), 1e-6)
-    unit = away / distance[:, None]
-    bent = (np.eye(3) - unit[:, :, None] * unit[:, None, :]) / distance[:, None, None] @ (own + other)
-    predicted = distance + 0.5 * np.einsum("kii->k", bent)
-    missed = 0.5 * np.einsum("kij,kji->k", bent, bent)
-    slope = np.concatenate([unit, offset_s * unit], axis=-1)
-    gain = np.einsum("kij,kj->ki", mixture.covariances[:, :, :6], slope)
-    known = np.einsum("ki,ij,kj->k", unit, other, unit)
-    total = np.einsum("ki,ki->k", slope, gain[:, :6]) + known + missed + variance
-    _update(mixture, gain, total, value_m - predicted)
+    parts = mixture.log_weights, mixture.means, mixture.covariances
+    log_weights, means, covariances = (np.array(part, order="C") for part in parts)
+    _use_range(log_weights, means, covariances, place, place_covariance, value_m, variance, offset_s)
+    mixture.log_weights, mixture.means, mixture.covariances = log_weights, means, covariances
+
+
+@entry(
+    "void(float64[::1], float64[:, ::1], float64[:, :, ::1], float64[::1], float64[:, ::1], float64, float64,"
+    " float64)"
+)
+def _use_range(
+    log_weights: Vector,
+    means: Matrix,
+    covariances: Matrix,
+    place: Vector,
+    place_covariance: Matrix,
+    value_m: float,
+    variance: float,
+    offset_s: float,
+) -> None:
+    size = means.shape[1]
+    other, both, bent = _moved(place_covariance, offset_s), np.empty((3, 3)), np.empty((3, 3))
+    away, unit, gain = np.empty(3), np.empty(3), np.empty(size)
+    for k in range(len(log_weights)):
+        mean, covariance = means[k], covariances[k]
+        both[:, :] = _moved(covariance, offset_s) + other
+        distance = 0.0
+        for i in range(3):
+            away[i] = mean[i] - place[i] + offset_s * (mean[3 + i] - place[3 + i])
+            distance += away[i] ** 2
+        distance = max(np.sqrt(distance), NEAREST_M)
+        unit[:] = away / distance
+        along = unit[0] * both[0] + unit[1] * both[1] + unit[2] * both[2]
+        for i in range(3):
+            bent[i] = (both[i] - unit[i] * along) / distance
+        total, predicted = variance, distance + 0.5 * (bent[0, 0] + bent[1, 1] + bent[2, 2])
+        for i in range(3):
+            for j in range(3):
+                total += 0.5 * bent[i, j] * bent[j, i] + unit[i] * other[i, j] * unit[j]
+        for i in range(size):
+            gain[i] = 0.0
+            for j in range(3):
+                gain[i] += (covariance[i, j] + offset_s * covariance[i, 3 + j]) * unit[j]
+        for j in range(3):
+            total += unit[j] * (gain[j] + offset_s * gain[3 + j])
+        innovation = value_m - predicted
+        log_weights[k] -= 0.5 * (innovation**2 / total + np.log(total))
+        for i in range(size):
+            mean[i] += gain[i] * innovation / total
+            for j in range(i, size):
+                reduced = 0.5 * (covariance[i, j] + covariance[j, i]) - gain[i] * gain[j] / total
+                covariance[i, j] = covariance[j, i] = reduced
+
+
+@kernel
+def _moved(covariance: Matrix, offset_s: float) -> Matrix:
+    """Covariance ``(3, 3)`` of the position of a state, ``offset_s`` later."""
+    out = np.empty((3, 3))
+    for i in range(3):
+        for j in range(3):
+            crossed = covariance[3 + i, j] + covariance[i, 3 + j]
+            out[i, j] = covariance[i, j] + offset_s * crossed + offset_s**2 * covariance[3 + i, 3 + j]
+    return out
 
 
 def _update(mixture: Mixture, gain: Matrix, variance: Vector, innovation: Vector) -> None:
@@ -178,14 +234,30 @@ def _merge(weights: Vector, means: Matrix, covariances: Matrix) -> int:
                 continue
             if j > k:
                 away[:] = means[j] - means[k]
-                solve_upper_transposed(factor, away)
-                if not (definite and np.dot(away, away) < MERGED_SQUARE):
+                if not (definite and _is_near(factor, away)):
                     continue
             near[found], open_[j] = j, False
             found += 1
         weights[kept] = _moments(weights, means, covariances, near[:found], means[kept], covariances[kept])
         kept += 1
     return kept
+
+
+@kernel
+def _is_near(factor: Matrix, away: Vector) -> bool:
+    """Whether ``away``, which is overwritten, is nearer than `MERGED_SQUARE`; a few states mostly say that it is not.
+
+    ``factor`` is the upper one of the covariance: its transpose is solved for, a state after the other.
+    """
+    square = 0.0
+    for i in range(len(away)):
+        away[i] /= factor[i, i]
+        square += away[i] * away[i]
+        if not square < MERGED_SQUARE:
+            return False
+        for j in range(i + 1, len(away)):
+            away[j] -= factor[i, j] * away[i]
+    return True
 
 
 @kernel
@@ -270,17 +342,22 @@ def split(mixture: Mixture, centre: Vector, widest_m: float, forward: Vector) ->
     while True:
         away = mixture.means[:, :3] - centre
         unit = away / np.maximum(np.linalg.norm(away, axis=-1), 1e-6)[:, None]
-        across = np.eye(3) - unit[:, :, None] * unit[:, None, :]
-        seen = across @ mixture.covariances[:, :3, :3] @ across
+        places = mixture.covariances[:, :3, :3]
+        all_m2 = np.einsum("kii->k", places) - np.einsum("ki,kij,kj->k", unit, places, unit)
+        may = np.flatnonzero(all_m2 > widest_m**2)  # no axis has more than all together
+        if not len(may):
+            return
+        across = np.eye(3) - unit[may, :, None] * unit[may, None, :]
+        seen = across @ places[may] @ across
         lean = across @ forward / max(float(np.linalg.norm(forward)), 1e-6)
-        size = np.einsum("kii->k", seen)
-        values, axes = np.linalg.eigh(seen + LEANING * size[:, None, None] * lean[:, :, None] * lean[:, None, :])
-        axis = axes[:, :, 2]
+        preferred = LEANING * all_m2[may, None, None] * lean[:, :, None] * lean[:, None, :]
+        axis = np.linalg.eigh(seen + preferred)[1][:, :, 2]
         wide = np.flatnonzero(np.einsum("ki,kij,kj->k", axis, seen, axis) > widest_m**2)
-        wide = wide[np.argsort(-mixture.log_weights[wide], kind="stable")][: (MOST - len(values)) // 2]
+        likeliest = np.argsort(-mixture.log_weights[may[wide]], kind="stable")
+        wide = wide[likeliest][: (MOST - len(unit)) // 2]
         if not len(wide):
             return
-        cut(mixture, wide, axis[wide])
+        cut(mixture, may[wide], axis[wide])
 
 
 def cut(mixture: Mixture, which: IntArray, axis: Matrix) -> None:

@@ -23,6 +23,7 @@ LEFT_OUT = {
     r"fleet configs/\S+ --duration 60 .*--lockstep": "a minute of flight for the tables; shorter ones are run",
     r"(agent|sim|monitor|ros2|uwb) ": "runs until it is stopped; tests/fleet and tests/fleetloc run them",
     r"sitl ": "needs autopilots in simulators",
+    r"doctor ": "listens to an autopilot; tests/fleetloc/doctor plays one",
     r"bench ": "a study takes minutes; tests/fleetloc/bench runs each with few runs",
 }
 OTHER_PROGRAMS = {

@@ -36,6 +36,7 @@ from agent.fleet.measurements import (
     gps_measurements,
     ground_measurement,
     height_measurement,
+    odometry_measurement,
     range_measurement,
 )
 from agent.fleet.neighbourhood import rounds_of
@@ -47,16 +48,19 @@ from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tel
 from agent.sensing.barometer import Barometer
 from agent.sensing.climb import without_climb
 from agent.sensing.gps_antenna import at_body
-from agent.sensing.ground import altitude_of
+from agent.sensing.ground import altitude_of, distance_of
 from agent.sensing.latency import GpsLatency
+from agent.sensing.odometry import Motion, Odometer, over_ground
 from agent.sensing.samples import (
     AttitudeSample,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
     RangeSample,
     Sample,
+    VelocitySample,
 )
 from agent.sensing.timeline import TickInput, Timeline, tick_of
 from agent.watch.health import HealthMonitor
@@ -79,6 +83,8 @@ FIX_SHARE = 0.1
 """Of an interval between fixes in their average."""
 USUAL_EXCHANGES = 2
 """Packets of records in every tick; more of `transport.exchanges` only where records of earlier ticks are lacked."""
+GROUND_AGE_S = 0.5
+"""A range finder's word that is older does not tell how far the ground is."""
 MAX_BEHIND_TICKS = 50
 """Further behind (a suspended computer, a clock set forward), the ticks between are left out."""
 
@@ -119,6 +125,9 @@ class AgentCore:
         self.gps_latency = GpsLatency(self._period_s, config.sensors)
         drifts = config.estimator.systematic_errors  # without, what drifts would be taken for true
         self.barometer = Barometer() if config.sensors.barometer and drifts else None
+        self._odometers = {kind: Odometer() for kind in ("odometry", "flow")}
+        self._ground: GroundSample | None = None
+        """The range finder's last word."""
         self.records = MeasurementStore(config, agent_id)
         self.neighbours = NeighbourTable(config, agent_id)
         self.watch = PositionWatch(config.transport.neighbour_timeout_s)
@@ -135,6 +144,8 @@ class AgentCore:
         self._last_fix_s: float | None = None
         self._altitude_m: float | None = None
         """Own altitude above the fleet's origin by the last estimate."""
+        self._motion: Motion | None = None
+        """Own velocity by the last estimate."""
         self._climb_mps: float | None = None
         """Own rate of climb or descent by the last estimate."""
         self._fix_interval_s: float | None = None
@@ -169,6 +180,10 @@ class AgentCore:
             self.on_baro(sample, now_s)
         elif isinstance(sample, GroundSample):
             self.on_ground(sample, now_s)
+        elif isinstance(sample, VelocitySample):
+            self.on_velocity(sample, now_s)
+        elif isinstance(sample, FlowSample):
+            self.on_flow(sample, now_s)
 
     def on_imu(self, sample: ImuSample, now_s: float) -> None:
         """An IMU sample."""
@@ -217,6 +232,7 @@ class AgentCore:
         ground_m = self._config.sensors.ground_m
         if not self._plausible("ground", sample.t_s, now_s):
             return
+        self._ground = sample
         if ground_m is None:
             self.counters["ground: switched off"] += 1
             return
@@ -225,6 +241,43 @@ class AgentCore:
             self.counters[f"ground: {found}"] += 1
         else:
             self._count_own("ground", ground_measurement(self._agent_id, sample.t_s, *found, self._period_s))
+
+    def on_velocity(self, sample: VelocitySample, now_s: float) -> None:
+        """A velocity of another sensor than the receiver."""
+        if self._plausible("odometry", sample.t_s, now_s):
+            self._take_velocity("odometry", sample)
+
+    def on_flow(self, sample: FlowSample, now_s: float) -> None:
+        """Optical flow, which tells a velocity where it is known how far the ground is."""
+        if not self._plausible("flow", sample.t_s, now_s):
+            return
+        distance_m = self._distance_m(sample)
+        if distance_m is None:
+            self.counters["flow: height unknown"] += 1
+        else:
+            self._take_velocity("flow", over_ground(sample, distance_m))
+
+    def _distance_m(self, sample: FlowSample) -> float | None:
+        """From the camera to the ground: as it says, by the range finder, or by the estimate above known ground."""
+        if sample.distance_m is not None:
+            return sample.distance_m
+        if self._ground is not None and abs(self._ground.t_s - sample.t_s) <= GROUND_AGE_S:
+            return self._ground.distance_m
+        ground_m, orientation = self._config.sensors.ground_m, self.timeline.orientation_at(sample.t_s)
+        if ground_m is None or self._altitude_m is None or orientation is None:
+            return None
+        return distance_of(self._altitude_m, orientation, ground_m)
+
+    def _take_velocity(self, sensor: str, sample: VelocitySample) -> None:
+        """Use a velocity, or count why not."""
+        if not self._config.sensors.odometry:
+            self.counters[f"{sensor}: switched off"] += 1
+            return
+        found = self._odometers[sensor].take(sample, self.timeline.orientation_at(sample.t_s), self._motion)
+        if isinstance(found, str):
+            self.counters[f"{sensor}: {found}"] += 1
+        else:
+            self._count_own(sensor, odometry_measurement(self._agent_id, sample.t_s, found, self._period_s))
 
     def on_range(self, sample: RangeSample, now_s: float) -> None:
         """A range that this agent's module measured."""
@@ -481,6 +534,7 @@ class AgentCore:
         if self.fleet.started:
             self.far_field.note_own(estimate, own)
             self._climb_mps, self._altitude_m = abs(float(estimate.mean[own][5])), -float(estimate.mean[own][2])
+            self._motion = _motion(estimate, own, self._tick * self._period_s)
         reports = self.far_field.packet(self._tick)
         outputs += (ready, Tell(message))  # nothing fails from here on: no tick has two estimates
         if reports is not None:
@@ -562,3 +616,10 @@ class AgentCore:
             self.counters[f"ticks: fixes of {agent_id} contradict"] += 1
             found.append(replace(finding, about=None if agent_id == self._agent_id else agent_id))
         return tuple(found)
+
+
+def _motion(estimate: Estimate, own: slice, t_s: float) -> Motion:
+    """The own velocity by an estimate."""
+    north, east, down = estimate.mean[own][3:].tolist()
+    a, b, c = estimate.covariance.diagonal()[own][3:].tolist()
+    return Motion(t_s, (north, east, down), (a, b, c))

@@ -71,6 +71,7 @@ LATER: Mapping[str, object] = {
     "estimator.robust": False,
     "fleet.joint_bodies": 999,
     "sensors.barometer": False,
+    "sensors.odometry": False,
 }
 """Keys that came later, and what was so before them: a flight log without such a key was flown like that."""
 

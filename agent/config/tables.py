@@ -163,6 +163,9 @@ class SensorsTable(Table, frozen=True):
     barometer: bool = True
     """Use the autopilot's barometer, where it sends one and the estimator has `systematic_errors`: it tells how the
     height changes, over minutes. Off where the drone flies in the wind of others, or indoors with doors that open."""
+    odometry: bool = True
+    """Use velocities of sensors other than the receiver, where a companion computer or the autopilot sends them
+    (ODOMETRY, VISION_SPEED_ESTIMATE, OPTICAL_FLOW_RAD). What was made of the autopilot's own estimate never is."""
     ground_m: float | None = None
     """Altitude above the fleet's origin of the ground, where it is flat and nothing stands on it: a range finder that
     looks down (DISTANCE_SENSOR) then tells the height; absent = range finders are not used."""

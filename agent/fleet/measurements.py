@@ -18,6 +18,7 @@ import numpy as np
 from agent.config.tables import SensorsTable
 from agent.fleet.lever_arms import LeverArms, Shift
 from agent.sensing.barometer import SIGMA_M
+from agent.sensing.odometry import MeasuredVelocity
 from agent.sensing.samples import BaroSample, GpsSample, RangeSample, Triple
 from agent.sensing.timeline import TickInput, nearest_tick
 from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
@@ -29,6 +30,7 @@ from transport.messages.measurement_body import (
     GroundHeightMeasurement,
     HeightMeasurement,
     Measurement,
+    OdometryMeasurement,
     OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
@@ -127,6 +129,16 @@ def ground_measurement(
     return GroundHeightMeasurement(observer, tick, -altitude_m, sigma_m**2, t_s - tick * period_s)
 
 
+def odometry_measurement(
+    observer: int, t_s: float, measured: MeasuredVelocity, period_s: float
+) -> OdometryMeasurement:
+    """The record of a velocity that is not the receiver's."""
+    tick = nearest_tick(t_s, period_s)
+    north, east, down = (min(variance, UNMEASURED_VARIANCE) for variance in measured.variance_m2ps2)
+    offset_s = t_s - tick * period_s
+    return OdometryMeasurement(observer, tick, measured.velocity_mps, (north, east, down), offset_s)
+
+
 def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMeasurement:
     """The record of a tick's averaged acceleration."""
     return AccelerationMeasurement(observer, closed.tick, closed.accel_mps2, closed.variance)
@@ -150,6 +162,9 @@ def rows_of(
             case VelocityMeasurement(_, _, value, variance, half_width, offset_s):
                 axes = zip(value, variance, half_width, _NED, strict=True)
                 rows += _axis_rows(Kind.VELOCITY, tick, offset_s, slot, axes)
+            case OdometryMeasurement(_, _, value, variance, offset_s):
+                axes = zip(value, variance, NO_BOUND, _NED, strict=True)
+                rows += _axis_rows(Kind.ODOMETRY, tick, offset_s, slot, axes)
             case SpeedMeasurement():
                 noise = record.variance_m2ps2, record.half_width_mps
                 shift = record.shift_mps if isinstance(record, AntennaSpeedMeasurement) else _NOWHERE

@@ -26,6 +26,7 @@ from agent.mavlink.sample_adapter import SampleAdapter
 from agent.mavlink.signing import LinkSigning
 from agent.mavlink.stream_rates import StreamRates, StreamState
 from agent.mavlink.timesync import BootClock
+from agent.mavlink.velocities import VELOCITY_MESSAGES, VelocityAdapter
 from agent.sensing.clock import FleetClock
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import Sample
@@ -108,6 +109,7 @@ class AutopilotSession:
             self._fleet_time_of_boot,
             own_receiver=config.fed_receiver(agent_id),
         )
+        self.velocities = VelocityAdapter(config.fleet.epoch_unix_s, self._fleet_time_of_boot)
         self._fed = config.feeds(agent_id)
         self.rates = StreamRates(_wanted(config, self._fed))
         self._asks_pressure = config.sensors.barometer
@@ -212,6 +214,8 @@ class AutopilotSession:
             self._sensed_s.setdefault(message.get_srcComponent(), {})[SENSORS[message_id]] = now_s
         source = (message.get_srcSystem(), message.get_srcComponent())
         if self.autopilot is None or source != (self.autopilot.system_id, self.autopilot.component_id):
+            if message_id in VELOCITY_MESSAGES and source[0] == self._expected_system:
+                return self._on_velocity(message, now_s, of_autopilot=source[1] == AUTOPILOT_COMPONENT)
             self._on_stranger(message)
             return []
         if self.follower is not None:
@@ -225,12 +229,21 @@ class AutopilotSession:
         self.rates.on_message(message_id)
         if message_id == mavlink.MAVLINK_MSG_ID_GPS2_RAW:  # there is a second receiver
             self.rates.add(message_id, self._settings.gps_hz)
+        if message_id in VELOCITY_MESSAGES:
+            return self._on_velocity(message, now_s, of_autopilot=True)
         boot_s = shown_boot_s(message)
         if boot_s is not None:
             self._on_boot_time(boot_s, now_s)
         arrival_s = self._fleet_clock.fleet_s(now_s)
         both = self.samples.convert(message, arrival_s), self.samples.pressure_beside(message, arrival_s)
         return [sample for sample in both if sample is not None]
+
+    def _on_velocity(self, message: Message, now_s: float, *, of_autopilot: bool) -> list[Sample]:
+        """What a companion, or the autopilot, says of a velocity."""
+        arrival_s = self._fleet_clock.fleet_s(now_s)
+        component = message.get_srcComponent()
+        sample = self.velocities.convert(message, arrival_s, component, of_autopilot=of_autopilot)
+        return [] if sample is None else [sample]
 
     def _on_heartbeat(self, message: Message, now_s: float) -> None:
         if not speaks_for_vehicle(message):
@@ -290,6 +303,7 @@ class AutopilotSession:
         self._answered = 0
         self.clock.reset()
         self.samples.reset()
+        self.velocities.reset()
         self._boot, self._doubtful = None, []
 
     def _on_stranger(self, message: Message) -> None:

@@ -24,3 +24,13 @@ def altitude_of(sample: GroundSample, orientation: Orientation | None, ground_m:
     turned_m = sample.distance_m * ATTITUDE_RAD * (1.0 - down * down) ** 0.5
     sigma_m = max(sample.sigma_m, SIGMA_FLOOR_M)
     return ground_m + down * sample.distance_m, (sigma_m * sigma_m + turned_m * turned_m) ** 0.5
+
+
+def distance_of(altitude_m: float, orientation: Orientation, ground_m: float) -> float | None:
+    """How far the ground is along the body's down axis, of a drone at an altitude; ``None`` if it cannot be told.
+
+    Altitude and ``ground_m`` are above the fleet's origin.
+    """
+    down = rotated(orientation.quaternion, (0.0, 0.0, 1.0))[2]
+    above_m = altitude_m - ground_m
+    return above_m / down if above_m > 0.0 and down >= LEAST_DOWN else None

@@ -92,6 +92,32 @@ class GroundSample:
 
 
 @dataclass(frozen=True, slots=True)
+class VelocitySample:
+    """A velocity in m/s of another sensor than the receiver, 1-sigma per axis (inf: not measured).
+
+    ``in_body``: body FRD, else NED.
+    """
+
+    t_s: float
+    velocity_mps: Triple
+    sigma_mps: Triple
+    in_body: bool
+
+
+@dataclass(frozen=True, slots=True)
+class FlowSample:
+    """How the ground below passes by a camera that looks down: speed over distance, forward and to the right, rad/s.
+
+    The body's turning is taken off; 1-sigma per axis. ``distance_m`` along the camera's axis, ``None``: not told.
+    """
+
+    t_s: float
+    passing_radps: tuple[float, float]
+    sigma_radps: float
+    distance_m: float | None
+
+
+@dataclass(frozen=True, slots=True)
 class RangeSample:
     """A range in m from agent ``observer`` to agent ``target``, 1-sigma in m; of which of their antennas."""
 
@@ -113,4 +139,14 @@ class AutopilotEstimate:
     velocity_mps: Triple
 
 
-Sample = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | RangeSample | AutopilotEstimate
+Sample = (
+    ImuSample
+    | AttitudeSample
+    | GpsSample
+    | BaroSample
+    | GroundSample
+    | VelocitySample
+    | FlowSample
+    | RangeSample
+    | AutopilotEstimate
+)

@@ -74,7 +74,7 @@ def _rss_mb() -> float:
     return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e3
 
 
-_ON_THE_LINK = ("imu", "attitude", "gps", "baro", "ground")
+_ON_THE_LINK = ("imu", "attitude", "gps", "baro", "ground", "odometry", "flow")
 
 
 def counters_of(onboard: OnboardAgent) -> dict[str, int]:
@@ -104,6 +104,7 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
         ("mavlink bad ", dict(decoder.bad)),
         ("mavlink refused ", {} if decoder.signing is None else dict(decoder.signing.refused)),
         ("skipped ", dict(session.samples.skipped)),
+        ("skipped ", dict(session.velocities.skipped)),
         ("noted ", dict(session.samples.noted)),
         ("", {} if onboard.feeder is None else dict(onboard.feeder.counters)),
         ("", _samples(onboard)),
@@ -124,7 +125,7 @@ def _samples(onboard: OnboardAgent) -> dict[str, int]:
 
     The rest is in the counters of what was skipped, at a wrong time or late.
     """
-    core, told = onboard.core, onboard.autopilot.samples.received
+    core, told = onboard.core, onboard.autopilot.samples.received + onboard.autopilot.velocities.received
     counted = {f"{kind}: received": told[kind] or core.counters[f"{kind}: samples"] for kind in _ON_THE_LINK}
     counted |= {f"{kind}: used": core.timeline.used[kind] for kind in ("imu", "attitude")}
     counted["range: received"] = (
@@ -215,6 +216,7 @@ def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
         "nis_gps_velocity": squares[Kind.VELOCITY],
         "nis_gps_speed": squares[Kind.SPEED],
         "nis_heights": squares[Kind.HEIGHT],
+        "nis_odometry": squares[Kind.ODOMETRY],
         "nis_ranges": squares[Kind.RANGE] if slot == own else innovations.pairs[own, slot],
         "weight_gps_position": innovations.weights[slot, Kind.POSITION],
     }

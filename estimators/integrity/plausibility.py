@@ -109,6 +109,7 @@ class PlausibilityMonitor:
         expected: dict[Kind, Callable[[], Vector]] = {
             Kind.POSITION: lambda: _along(axis, place),
             Kind.VELOCITY: lambda: _along(axis, velocity),
+            Kind.ODOMETRY: lambda: _along(axis, velocity),
             Kind.SPEED: lambda: _length(velocity + axis),
             Kind.RANGE: lambda: _length(place - there + axis),
             Kind.ANCHOR_RANGE: lambda: _length(place - axis),
@@ -130,7 +131,7 @@ def _with_their_fixes(rows: RowTable, refused: NDArray[np.bool_]) -> NDArray[np.
         return refused
     whole = [rows[name].astype(np.float64) for name in ("observer", "kind", "tick", "offset_s")]
     _, fix = np.unique(np.stack(whole, axis=1), axis=0, return_inverse=True)
-    vectors = np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY))
+    vectors = np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY))
     return np.asarray(refused | (vectors & np.isin(fix.ravel(), fix.ravel()[refused & vectors])))
 
 

@@ -37,6 +37,8 @@ class Kind(IntEnum):
     HEIGHT = 5
     """The third component of ``p + v o``, NED m; ``x`` is how much it holds of the agent's height errors: 1 for a
     barometer, 0 for a range finder above known ground."""
+    ODOMETRY = 6
+    """``direction . v`` in m/s, as `VELOCITY`, of another sensor than the receiver: neither vouches for the other."""
 
 
 ROW = np.dtype(
@@ -46,7 +48,7 @@ ROW = np.dtype(
         ("value", np.float64),  # m or m/s
         ("variance", np.float64),  # of the noise, unit of value squared
         ("half_width", np.float64),  # hard bound on the noise; inf where the sensor has none
-        ("x", np.float64),  # unit direction (POSITION, VELOCITY), anchor (ANCHOR_RANGE), shift s (others), NED
+        ("x", np.float64),  # unit direction (POSITION, velocities), anchor (ANCHOR_RANGE), shift s (others), NED
         ("y", np.float64),
         ("z", np.float64),
         ("kind", np.int32),
@@ -136,10 +138,14 @@ def velocity_rows(
     offset_s: float = 0.0,
     half_width_mps: ArrayLike = np.inf,
     observer: int | None = None,
+    kind: Kind = Kind.VELOCITY,
 ) -> RowTable:
-    """Rows of a velocity vector ``(3,)`` NED m/s with covariance ``(3, 3)`` or variances ``(3,)``."""
+    """Rows of a velocity vector ``(3,)`` NED m/s with covariance ``(3, 3)`` or variances ``(3,)``.
+
+    ``kind``: `Kind.VELOCITY` of a receiver, or `Kind.ODOMETRY`.
+    """
     direction, value, variance, half = _principal_axes(velocity_mps, covariance, half_width_mps)
-    return _vector_rows(Kind.VELOCITY, tick, agent, offset_s, observer, direction, value, variance, half)
+    return _vector_rows(kind, tick, agent, offset_s, observer, direction, value, variance, half)
 
 
 def _vector_rows(

@@ -1,8 +1,9 @@
 """Compiled evaluation of measurement rows: value, gradient, curvature.
 
-A window's rows enter the kernels as two arrays, sorted by tick: ``code`` ``(m, 3)`` int64 holds kind and the
-first state index of the two agents (-1: none); ``data`` ``(m, 7)`` float64 holds offset, value, 1/variance,
-half width, and the vector ``x y z`` of `estimators.measurements.ROW`.
+A window's rows enter the kernels as two arrays, sorted by tick: ``code`` ``(m, 3)`` int64 holds kind (VELOCITY for
+ODOMETRY, which differs in whose sensor it is) and the first state index of the two agents (-1: none); ``data``
+``(m, 7)`` float64 holds offset, value, 1/variance, half width, and the vector ``x y z`` of
+`estimators.measurements.ROW`.
 
 A gradient has the same shape for all kinds: a 3-vector u that acts on the position (and, times the offset, on
 the velocity) of one or two agents, or on the velocity of one.
@@ -25,6 +26,7 @@ SPEED = int(Kind.SPEED)
 RANGE = int(Kind.RANGE)
 ANCHOR_RANGE = int(Kind.ANCHOR_RANGE)
 HEIGHT = int(Kind.HEIGHT)
+ODOMETRY = int(Kind.ODOMETRY)
 LAST_KIND = int(max(Kind))
 
 OFFSET, VALUE, PRECISION, HALF_WIDTH, X, Y, Z = range(7)
@@ -62,7 +64,7 @@ def encode_rows(rows: RowTable, local: IntArray, code: IntArray, data: Matrix) -
     """Fill ``code`` and ``data`` from the row table; ``local[slot]`` is the slot in the reduced problem."""
     for r in range(rows.shape[0]):
         row = rows[r]
-        code[r, 0] = row["kind"]
+        code[r, 0] = VELOCITY if row["kind"] == ODOMETRY else row["kind"]
         code[r, 1] = STATES_PER_AGENT * local[row["agent"]]
         code[r, 2] = -1 if row["other"] < 0 else STATES_PER_AGENT * local[row["other"]]
         data[r, OFFSET] = row["offset_s"]

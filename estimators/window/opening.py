@@ -37,7 +37,7 @@ def guess_of_linear_rows(
 
     None where all rows are linear, and where there are none. Raises ``ArithmeticError`` as `solve_slow` does.
     """
-    linear = np.isin(problem.rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.HEIGHT))
+    linear = np.isin(problem.rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY, Kind.HEIGHT))
     if linear.all() or not linear.any():
         return None
     data = problem.window.data.copy()

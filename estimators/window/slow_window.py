@@ -14,6 +14,7 @@ from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.motion import predict_mean
 from estimators.model.row_kernels import (
     HALF_WIDTH,
+    ODOMETRY,
     POSITION,
     PRECISION,
     VALUE,
@@ -128,7 +129,8 @@ def _encode(rows: RowTable, agents: int, white: Matrix, code: IntArray, data: Ma
                 scale += (direction * white[row["agent"], i]) ** 2
             data[r, PRECISION] /= scale
         before = rows[r - 1]
-        same = r > 0 and (row["kind"] == POSITION or row["kind"] == VELOCITY) and row["kind"] == before["kind"]
+        vector = row["kind"] == POSITION or row["kind"] == VELOCITY or row["kind"] == ODOMETRY
+        same = r > 0 and vector and row["kind"] == before["kind"]
         same = same and row["tick"] == before["tick"] and row["observer"] == before["observer"]
         same = same and row["agent"] == before["agent"] and row["offset_s"] == before["offset_s"]
         group[r] = group[r - 1] if same else r

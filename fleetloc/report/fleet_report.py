@@ -28,10 +28,14 @@ from transport.messages.report_body import Diagnostics
 
 SETTLED_S = 10.0
 """Errors are also given from here on, when what an agent knew at its start is forgotten."""
-SENSORS = {"imu": "imu", "attitude": "attitude", "gps": "gps", "baro": "baro", "ground": "ground", "range": "uwb"}
+SENSORS = {
+    "imu": "imu", "attitude": "attitude", "gps": "gps", "baro": "baro", "ground": "ground", "odometry": "odometry",
+    "flow": "flow", "range": "uwb",
+}  # fmt: skip
 """Names of the core's counters, and of the counters of what was left out before."""
 LEFT_OUT = (
     "switched off", "place unknown", "more than are needed", "always the same", "attitude unknown", "too much tilt",
+    "nothing measured", "height unknown", "contradicts the estimate",
 )  # fmt: skip
 """Why the core uses no sample of a sensor that came in time."""
 

@@ -22,6 +22,7 @@ from sim_bridge.replay.injection import Injection, parsed_faults
 from sim_bridge.replay.logs.events import LogError, LogSource, TruthSample
 from sim_bridge.replay.logs.frames import frame_about, origin_of
 from sim_bridge.replay.logs.opening import open_log
+from sim_bridge.replay.logs.surveyed import OwnWords
 from sim_bridge.replay.naming import names_apart
 from sim_bridge.replay.plan import PlannedVehicle, ReplayPlan, make_plan
 from sim_bridge.replay.reading import surveyed
@@ -164,7 +165,8 @@ def _config_and_logs(options: Options) -> tuple[FleetConfig, list[LogSource], st
         sensors = config_of(document.with_table("fleet", {**fleet, "origin": anywhere})).sensors
         config, origin_from = _with_origin_of_logs(document, options.logs, sensors)
     frame = FleetFrame.of(config)
-    sources = surveyed([open_log(path, frame=frame, sensors=config.sensors) for path in options.logs])
+    ours = OwnWords(config.mavlink.component_id, config.feedback.kind == "odometry")
+    sources = surveyed([open_log(path, frame=frame, sensors=config.sensors, ours=ours) for path in options.logs])
     return config, sources, origin_from
 
 

@@ -20,9 +20,11 @@ from agent.sensing.samples import (
     AttitudeSample,
     AutopilotEstimate,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
+    VelocitySample,
 )
 from sim_bridge.replay.injection import Injection
 from sim_bridge.replay.logs.events import LogCounts, LogSample, LogSource, TruthSample
@@ -31,7 +33,9 @@ from sim_bridge.replay.side_files.range_files import RangeCounts, RangeLine
 from sim_bridge.replay.synthesis import Synthesiser
 from sim_bridge.replay.what_if import GpsDrops
 
-Heard = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | RangeLine
+Heard = (
+    ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | VelocitySample | FlowSample | RangeLine
+)
 """What agents get, stamped in fleet time."""
 Arrival = tuple[float, int, Heard | None]
 """Fleet time of arrival, agent, and what arrived; ``None``: nothing for an agent, but that late it is."""

@@ -93,6 +93,8 @@ class Scenario:
     uwb_reach_m: float = math.inf
     uwb_calibrated: bool = True
     """False: pairs have the bias of modules as delivered, 0.3 m on average."""
+    odometry_hz: float = 0.0
+    """Rate at which a camera of each vehicle tells its velocity; 0 = there are none."""
     gps_speed: Literal["horizontal", "norm"] = "horizontal"
     """What GPS_RAW_INT.vel holds: ground speed, as receivers have it, or the velocity's norm (the paper)."""
     fusing: bool = False
@@ -155,6 +157,10 @@ class Scenario:
             rate = getattr(self, key)
             if not 0.0 < rate <= STEP_RATE_HZ:
                 raise ScenarioError(f"scenario: {key}: expected more than 0 and at most {STEP_RATE_HZ}, found {rate}")
+        if not 0.0 <= self.odometry_hz <= STEP_RATE_HZ:
+            raise ScenarioError(
+                f"scenario: odometry_hz: expected from 0 to {STEP_RATE_HZ}, found {self.odometry_hz}"
+            )
         if not (math.isfinite(self.period_s) and self.period_s > 0.0):
             raise ScenarioError(f"scenario: period_s: expected a positive number, found {self.period_s}")
 

@@ -31,6 +31,7 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         gravity_mps2=gravity_mps2(config),
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,
+        odometry_hz=sim.odometry_hz,
         uwb_staggered=sim.profile != "paper",
         gps_speed="norm" if config.sensors.gps_speed == "norm" else "horizontal",
         fusing=sim.autopilots == "fusing",

@@ -12,8 +12,9 @@ from typing import Any
 
 from agent.mavlink.session import PRESSURE_HZ
 from agent.sensing.barometer import pressure_altitude_m
-from agent.sensing.samples import AttitudeSample, BaroSample, ImuSample
+from agent.sensing.samples import AttitudeSample, BaroSample, ImuSample, VelocitySample
 from sim_bridge.autopilot.mavlink_wire import gps_raw_int
+from sim_bridge.companions.camera import SIGMA_MPS
 from sim_bridge.world.sensors import SensedImu, SensedRanges, quaternion_of, vector_of
 from sim_bridge.world.simulation import Simulation
 from sim_bridge.world.truth import Truth, TruthRecorder
@@ -29,7 +30,7 @@ class Sensed:
     A fix stays a message since the agent makes its variances of what the receiver says.
     """
 
-    samples: list[tuple[int, ImuSample | AttitudeSample | BaroSample]] = field(default_factory=list)
+    samples: list[tuple[int, ImuSample | AttitudeSample | BaroSample | VelocitySample]] = field(default_factory=list)
     fixes: list[tuple[int, Any]] = field(default_factory=list)
     ranges: list[SensedRanges] = field(default_factory=list)
 
@@ -90,6 +91,12 @@ class SensorFeed:
                 # PX4 has the pressure in each HIGHRES_IMU, ArduPilot in messages of its own
                 if pressure_due or scenario.vehicles[slot].flavour == "px4":
                     sensed.samples += [(agent_id, baro) for baro in _height(imu, t_s)]
+        for slot, companion in enumerate(self._simulation.companions):
+            velocity = companion.camera.velocity(world.time_s, world.velocity_mps[slot], world.attitude()[slot])
+            if velocity is not None:
+                spread = (SIGMA_MPS, SIGMA_MPS, SIGMA_MPS)
+                told = VelocitySample(t_s, vector_of(velocity), spread, in_body=True)
+                sensed.samples.append((scenario.ids[slot], told))
         for slot, fix in sensors.fixes():
             if fix.valid:
                 self._aided_until_s[slot] = world.time_s + AIDED_S

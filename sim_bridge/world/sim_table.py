@@ -102,6 +102,8 @@ class SimTable(Table, frozen=True):
     """Rate of the simulated receiver."""
     uwb_hz: Annotated[float, msgspec.Meta(ge=0.2, le=200)] = 10.0
     """Rate at which every pair ranges."""
+    odometry_hz: Annotated[float, msgspec.Meta(ge=0, le=100)] = 0.0
+    """Rate at which a camera of each drone tells its velocity (ODOMETRY of a companion); 0 = there are none."""
     uwb_module: Literal["none", "linktrack", "uci", "dwm1001", "dwm3001-cli"] = "none"
     """What measures the ranges of a live fleet: modules simulated down to their bytes, on pseudo terminals behind
     `fleetloc uwb`; or, with none, the simulator's own driver, which sends frames."""

@@ -17,6 +17,7 @@ from agent.mavlink.dialect import mavlink
 from sim_bridge.autopilot.fake_autopilot import AutopilotSetup, FakeAutopilot
 from sim_bridge.autopilot.link_faults import FaultyLink
 from sim_bridge.autopilot.truth_messages import TrueState
+from sim_bridge.companions.camera import Camera, Companion
 from sim_bridge.world import quaternions
 from sim_bridge.world.guidance import Waypoints, default_path, moved_along
 from sim_bridge.world.quaternions import Array
@@ -131,6 +132,7 @@ class Simulation:
             vehicle.agent: FakeAutopilot(self._setup(slot), self._vehicle(slot), start_s)
             for slot, vehicle in enumerate(scenario.vehicles)
         }
+        self.companions = companions(scenario)
         self.dropped: Counter[int] = Counter()
         """Frames lost on a silenced link, by agent."""
         links = np.random.SeedSequence((scenario.seed, 2)).spawn(2 * len(scenario.ids))
@@ -198,6 +200,10 @@ class Simulation:
             self.autopilots[ids[slot]].on_fix(fix, self.start_s + fix.time_s, now)
         for agent, autopilot in self.autopilots.items():
             self._send(agent, autopilot.advance(now), outputs.frames)
+        for slot, companion in enumerate(self.companions):
+            frame = companion.frame(self.world.time_s, self.world.velocity_mps[slot], self.world.attitude()[slot])
+            if frame is not None:
+                self._send(ids[slot], [frame], outputs.frames)
         if self.scenario.fusing:
             self._fly_by_belief()
         outputs.ranges += [(now, ranges) for ranges in self.sensors.ranges()]
@@ -272,3 +278,14 @@ def _world(scenario: Scenario) -> FleetWorld:
         yaw_rate_radps=scenario.yaw_rate_radps,
         on_ground=np.array([vehicle.on_ground for vehicle in scenario.vehicles]),
     )
+
+
+def companions(scenario: Scenario) -> list[Companion]:
+    """A companion with a camera per vehicle, where there are any."""
+    if not scenario.odometry_hz:
+        return []
+    seeds = np.random.SeedSequence((scenario.seed, 3)).spawn(len(scenario.ids))
+    return [
+        Companion(vehicle.system_id, Camera(scenario.odometry_hz, np.random.default_rng(seed)))
+        for vehicle, seed in zip(scenario.vehicles, seeds, strict=True)
+    ]

@@ -9,7 +9,15 @@ import pytest
 
 from agent.core import AgentCore
 from agent.outputs import EstimateReady, Tell
-from agent.sensing.samples import AttitudeSample, BaroSample, GroundSample, ImuSample, RangeSample
+from agent.sensing.samples import (
+    AttitudeSample,
+    BaroSample,
+    FlowSample,
+    GroundSample,
+    ImuSample,
+    RangeSample,
+    VelocitySample,
+)
 from estimators.estimator import Status
 from estimators.model.measurements import Kind
 from tests.support.circling_fleet import CirclingFleet
@@ -93,6 +101,48 @@ def test_a_range_finders_heights_become_rows_where_the_ground_is_known(make_conf
         assert heights["x"].tolist() == [0.0] * expected
         assert core.counters["ground: used"] == expected
         heights_counted(core, "ground")
+
+
+def test_velocities_of_other_sensors_become_rows_by_the_attitude_of_their_instant(make_config: MakeConfig) -> None:
+    for settings, expected in (((), 1), (("sensors.odometry=false",), 0)):
+        core, made = lone(make_config, *settings)
+        tick_through(core, 100.0, 0.4)
+        heading_east = (np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5))
+        core.on_sample(VelocitySample(100.41, (1.5, 0.0, 0.0), (0.2, 0.2, 0.3), in_body=True), 100.42)
+        core.on_sample(VelocitySample(90.0, (1.5, 0.0, 0.0), (0.2, 0.2, 0.3), in_body=True), 100.42)
+        core.on_sample(AttitudeSample(100.62, heading_east), 100.62)
+        core.on_sample(VelocitySample(100.62, (1.5, 0.1, 0.0), (0.2, 0.2, 0.3), in_body=True), 100.63)
+        core.on_sample(VelocitySample(100.65, (1.5, 0.0, 0.0), (0.2, 0.2, 0.3), in_body=True), 100.66)
+        tick_through(core, 100.42, 0.5)
+        begun = [call[2] for call in made[0].calls if call[0] == "begin"]
+        rows = np.concatenate([rows[rows["kind"] == Kind.ODOMETRY] for rows in begun])
+        assert rows["value"] == pytest.approx([-0.1, 1.5, 0.0][: 3 * expected], abs=1e-6)
+        assert rows["tick"].tolist() == [1006] * 3 * expected
+        assert core.counters["odometry: used"] == expected
+        assert core.counters["odometry: wrong time"] == 1
+        if expected:
+            assert core.counters["odometry: attitude unknown"] == 1
+            assert core.counters["odometry: more than are needed"] == 1
+        heights_counted(core, "odometry")
+
+
+def test_flow_is_used_where_somebody_knows_how_far_the_ground_is(make_config: MakeConfig) -> None:
+    core, made = lone(make_config)
+    core.advance(100.0, CONNECTED)
+    level = (1.0, 0.0, 0.0, 0.0)
+    for k, told_m in enumerate((None, 5.0, None)):
+        t_s = 100.1 + 0.3 * k
+        if k == 2:
+            core.on_sample(GroundSample(t_s - 0.1, 8.0, 0.1), t_s)
+        core.on_sample(AttitudeSample(t_s, level), t_s)
+        core.on_sample(FlowSample(t_s, (0.2, -0.1), 0.05, told_m), t_s)
+        tick_through(core, t_s, 0.3)
+    begun = [call[2] for call in made[0].calls if call[0] == "begin"]
+    rows = np.concatenate([rows[rows["kind"] == Kind.ODOMETRY] for rows in begun])
+    assert rows["value"] == pytest.approx([1.0, -0.5, 1.6, -0.8], abs=1e-6)
+    assert core.counters["flow: height unknown"] == 1
+    assert core.counters["flow: used"] == 2
+    heights_counted(core, "flow")
 
 
 def test_a_fix_that_comes_late_keeps_its_place(make_config: MakeConfig) -> None:

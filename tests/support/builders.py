@@ -65,8 +65,9 @@ def row_of(
     variance = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.1))))
     if kind is Kind.POSITION:
         return position_rows(tick, agent, np.zeros(3), random_covariance(rng, 3, variance), offset_s=offset_s)
-    if kind is Kind.VELOCITY:
-        return velocity_rows(tick, agent, np.zeros(3), random_covariance(rng, 3, variance), offset_s=offset_s)
+    if kind in (Kind.VELOCITY, Kind.ODOMETRY):
+        covariance = random_covariance(rng, 3, variance)
+        return velocity_rows(tick, agent, np.zeros(3), covariance, offset_s=offset_s, kind=kind)
     if kind is Kind.SPEED:
         return speed_row(tick, agent, 0.0, variance, offset_s=offset_s)
     if kind is Kind.ANCHOR_RANGE:

@@ -48,7 +48,7 @@ def predicted_row(row: np.void, x: Array, eps: float) -> float:
         return float(direction @ (p + o * v))
     if row["kind"] == Kind.HEIGHT:
         return float(p[2] + o * v[2])
-    if row["kind"] == Kind.VELOCITY:
+    if row["kind"] in (Kind.VELOCITY, Kind.ODOMETRY):
         return float(direction @ v)
     if row["kind"] == Kind.SPEED:
         return float(np.sqrt(v @ v + eps**2))
@@ -72,7 +72,7 @@ def jacobian(rows: RowTable, x: Array, eps: float) -> Array:
         a, o = int(row["agent"]), float(row["offset_s"])
         p, v = slice(6 * a, 6 * a + 3), slice(6 * a + 3, 6 * a + 6)
         direction = np.array([row["x"], row["y"], row["z"]])
-        if row["kind"] == Kind.VELOCITY:
+        if row["kind"] in (Kind.VELOCITY, Kind.ODOMETRY):
             out[r, v] = direction
         elif row["kind"] == Kind.SPEED:
             out[r, v] = x[v] / np.sqrt(x[v] @ x[v] + eps**2)

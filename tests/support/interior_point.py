@@ -74,7 +74,7 @@ def _predicted(casadi: Any, row: np.void, x: Any, eps: float) -> Any:
             return casadi.dot(direction, place)
         case Kind.HEIGHT:
             return place[2]
-        case Kind.VELOCITY:
+        case Kind.VELOCITY | Kind.ODOMETRY:
             return casadi.dot(direction, velocity)
         case Kind.SPEED:
             return casadi.sqrt(casadi.sumsqr(velocity) + eps**2)

@@ -92,7 +92,7 @@ class JointWindow:
         self.size = self.d + self.q + self.ticks * 3 * agents
         self.moves, self.offsets = self._affine(agents, period_s)
         keys = [
-            (r,) if row["kind"] not in (Kind.POSITION, Kind.VELOCITY)
+            (r,) if row["kind"] not in (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY)
             else tuple(float(row[name]) for name in ("tick", "observer", "kind", "agent", "offset_s"))
             for r, row in enumerate(rows)
         ]  # fmt: skip

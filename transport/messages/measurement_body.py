@@ -76,6 +76,7 @@ class MeasurementKind(IntEnum):
     ANTENNA_SPEED = 9
     HEIGHT = 10
     GROUND_HEIGHT = 11
+    ODOMETRY = 13
 
 
 _Floats = tuple[float, ...]
@@ -264,6 +265,21 @@ class GroundHeightMeasurement(HeightMeasurement):
 
 
 @dataclass(frozen=True)
+class OdometryMeasurement(_Record):
+    """A velocity of ``observer`` by another sensor than its receiver: NED m/s, variances (m/s)2 per axis."""
+
+    kind = MeasurementKind.ODOMETRY
+    limit = MAX_SPEED_MPS
+
+    velocity_mps: Triple
+    variance_m2ps2: Triple
+    offset_s: float = 0.0
+
+    def parts(self) -> _Parts:
+        return _Parts((self.offset_s,), self.velocity_mps, self.variance_m2ps2, ())
+
+
+@dataclass(frozen=True)
 class AccelerationMeasurement(_Record):
     """The acceleration of ``observer`` averaged over ``tick`` to ``tick + 1``: NED m/s2, gravity removed."""
 
@@ -301,6 +317,7 @@ Measurement = (
     | RangeMeasurement
     | AnchorRangeMeasurement
     | HeightMeasurement
+    | OdometryMeasurement
     | AccelerationMeasurement
     | OrientationMeasurement
 )
@@ -317,6 +334,7 @@ _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.ANTENNA_SPEED: struct.Struct("<BHBff3eee"),
     MeasurementKind.HEIGHT: struct.Struct("<BHBffe"),
     MeasurementKind.GROUND_HEIGHT: struct.Struct("<BHBffe"),
+    MeasurementKind.ODOMETRY: struct.Struct("<BHBf3f3e"),
 }
 _HEIGHTS: dict[int, type[HeightMeasurement]] = {
     MeasurementKind.HEIGHT: HeightMeasurement,
@@ -537,6 +555,9 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
         velocity = _triple(_bounded(fields[4:7], MAX_SPEED_MPS, "velocity"))
         variance = _triple(_variances(fields[7:10]))
         return VelocityMeasurement(observer, tick, velocity, variance, _triple(_widths(fields[10:13])), offset)
+    if kind == MeasurementKind.ODOMETRY:
+        velocity = _triple(_bounded(fields[4:7], MAX_SPEED_MPS, "velocity"))
+        return OdometryMeasurement(observer, tick, velocity, _triple(_variances(fields[7:])), offset)
     if kind in _HEIGHTS:
         down_m = _bounded(fields[4:5], MAX_POSITION_M, "height")[0]
         return _HEIGHTS[kind](observer, tick, down_m, _variances(fields[5:])[0], offset)

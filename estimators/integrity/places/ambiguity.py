@@ -218,7 +218,8 @@ class AmbiguityMonitor:
         """Move to this tick and use its rows other than ranges."""
         rows = evidence.rows
         kind = rows["kind"]
-        linear = rows[(kind == Kind.POSITION) | (kind == Kind.VELOCITY) | (kind == Kind.HEIGHT)]
+        moves = (kind == Kind.VELOCITY) | (kind == Kind.ODOMETRY)
+        linear = rows[moves | (kind == Kind.POSITION) | (kind == Kind.HEIGHT)]
         before, self._drift = self._drift, evidence.drift
         predict(mixture, evidence.accel, evidence.accel_variance, self._period_s, evidence.drift)
         if before is not None and evidence.drift is not None:  # an attitude that tilts does so at once
@@ -371,7 +372,7 @@ def rows_of(rows: RowTable, slot: int) -> RowTable:
 
 def _slope(row: np.void) -> Vector:
     direction = np.array([row["x"], row["y"], row["z"]] if row["kind"] != Kind.HEIGHT else [0.0, 0.0, 1.0])
-    if row["kind"] == Kind.VELOCITY:
+    if row["kind"] in (Kind.VELOCITY, Kind.ODOMETRY):
         return np.concatenate([np.zeros(3), direction])
     return np.concatenate([direction, float(row["offset_s"]) * direction])
 

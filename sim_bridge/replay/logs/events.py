@@ -27,11 +27,13 @@ from agent.sensing.samples import (
     AttitudeSample,
     AutopilotEstimate,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
     Quaternion,
     Triple,
+    VelocitySample,
 )
 
 Format = Literal["tlog", "dataflash", "ulog"]
@@ -66,7 +68,17 @@ class TruthSample:
     has_height: bool = True
 
 
-LogSample = ImuSample | AttitudeSample | GpsSample | BaroSample | GroundSample | AutopilotEstimate | TruthSample
+LogSample = (
+    ImuSample
+    | AttitudeSample
+    | GpsSample
+    | BaroSample
+    | GroundSample
+    | VelocitySample
+    | FlowSample
+    | AutopilotEstimate
+    | TruthSample
+)
 """Samples on log time. An `AutopilotEstimate` of a log is in the frame that `SystemSurvey.estimate_frame` says:
 the fleet's, unless the log does not tell where the autopilot's own origin is."""
 
@@ -76,6 +88,8 @@ KINDS: dict[type, str] = {
     GpsSample: "gps",
     BaroSample: "baro",
     GroundSample: "ground",
+    VelocitySample: "odometry",
+    FlowSample: "flow",
     AutopilotEstimate: "autopilot estimate",
     TruthSample: "truth",
 }

@@ -11,6 +11,7 @@ from sim_bridge.replay.logs.dataflash.records import FORMAT_OF_FORMAT
 from sim_bridge.replay.logs.dataflash.source import DataflashSource
 from sim_bridge.replay.logs.events import LogError, LogSource
 from sim_bridge.replay.logs.files import opened
+from sim_bridge.replay.logs.surveyed import OwnWords
 from sim_bridge.replay.logs.telemetry.frames import STAMP_BYTES, V1, V2, is_frame
 from sim_bridge.replay.logs.telemetry.source import TlogSource
 from sim_bridge.replay.logs.ulog.source import MAGIC, UlogSource
@@ -20,7 +21,9 @@ FEW_FRAMES = 2
 _EXPECTED = "a flight log (.tlog, dataflash .BIN, .ulg; gzip accepted)"
 
 
-def open_log(path: Path, *, frame: FleetFrame | None, sensors: SensorsTable) -> LogSource:
+def open_log(
+    path: Path, *, frame: FleetFrame | None, sensors: SensorsTable, ours: OwnWords = OwnWords()
+) -> LogSource:
     """A flight log, plain or gzip; nothing but its beginning is read yet.
 
     Without ``frame`` positions are about the log's own origin, home or first fix. Raises `LogError` if the
@@ -32,13 +35,13 @@ def open_log(path: Path, *, frame: FleetFrame | None, sensors: SensorsTable) -> 
     if not head:
         raise LogError(path, _EXPECTED, "a damaged gzip stream" if skipped else "an empty file")
     if head.startswith(MAGIC):
-        return UlogSource(path, frame, sensors)
+        return UlogSource(path, frame, sensors, ours)
     if FORMAT_OF_FORMAT in head:
-        return DataflashSource(path, frame, sensors)
+        return DataflashSource(path, frame, sensors, ours)
     if _holds_frames(head):
         if _without_stamps(head):
             raise LogError(path, "frames with time stamps (the .tlog beside it)", "frames without any (a .tlog.raw?)")
-        return TlogSource(path, frame, sensors)
+        return TlogSource(path, frame, sensors, ours)
     raise LogError(path, _EXPECTED, f"{len(head)} bytes of something else, beginning {head[:8]!r}")
 
 

@@ -3,19 +3,33 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from dataclasses import dataclass
 from pathlib import Path
 
-from agent.config.tables import SensorsTable
+from agent.config.tables import MavlinkTable, SensorsTable
 from agent.sensing.frames import FleetFrame
 from sim_bridge.replay.logs.events import LogCounts, LogSurvey
 from sim_bridge.replay.logs.frames import frame_about
 
 
+@dataclass(frozen=True, slots=True)
+class OwnWords:
+    """What of a log may be what fleetloc gave the autopilot, and is no measurement."""
+
+    component_id: int = MavlinkTable().component_id
+    """Of the daemon on the links."""
+    odometry: bool = False
+    """Whether autopilots were given odometry: logs of theirs do not say by whom."""
+
+
 class SurveyedLog(ABC):
     """A `LogSource` but for its format and events; ``frame`` is that of its positions, ``None``: the log's own."""
 
-    def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
+    def __init__(
+        self, path: Path, frame: FleetFrame | None, sensors: SensorsTable, ours: OwnWords = OwnWords()
+    ) -> None:
         self.path = path
+        self._ours = ours
         self._given_frame = frame
         self._sensors = sensors
         self._survey: LogSurvey | None = None

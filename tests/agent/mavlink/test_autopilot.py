@@ -14,7 +14,7 @@ from agent.mavlink.codec import Encoder, mavlink
 from agent.mavlink.session import AutopilotSession, LinkState
 from agent.mavlink.slow_streams import SlowStreamLog, slow_findings, slow_text
 from agent.mavlink.stream_rates import StreamState
-from agent.sensing.samples import AttitudeSample, GpsSample, ImuSample, Sample
+from agent.sensing.samples import AttitudeSample, FlowSample, GpsSample, ImuSample, Sample, VelocitySample
 from agent.watch.health import State, assess
 from estimators.integrity.finding import Finding, Gravity, What
 from tests.support.onboard import onboard_of
@@ -408,3 +408,25 @@ def test_frames_of_other_systems_are_not_heard_as_the_autopilot(bench: Callable[
     assert b.session.heard == heard
     b.run(1)
     assert b.session.heard > heard
+
+
+def test_velocities_are_taken_from_other_components_only(bench: Callable[..., Bench]) -> None:
+    # GIVEN the autopilot's own velocity, ours sent back, another vehicle's, and a companion's
+    made = bench()
+    made.run(2.0)
+    before = made.session.heard
+    vision = mavlink.MAVLink_vision_speed_estimate_message(0, 1.0, 2.0, 0.0)
+    for source in ((1, 1), (1, 197), (2, 191), (1, 191)):
+        made.samples += made.session.receive(Encoder(*source).encode(vision), made.now_s)
+    velocities = made.of(VelocitySample)
+    # THEN the companion's alone is a measurement
+    assert [sample.velocity_mps for sample in velocities] == [(1.0, 2.0, 0.0)]
+    told = made.session.velocities
+    assert told.received["odometry"] == 2
+    assert told.skipped == {"odometry: the autopilot's own": 1}
+    assert made.session.ignored["own frame"] == 1
+    assert made.session.heard == before + 2
+    # AND flow is whoever passes it on
+    flow = mavlink.MAVLink_optical_flow_rad_message(0, 0, 100_000, 0.0, 0.1, 0.0, 0.0, 0.0, 0, 255, 0, 4.0)
+    made.samples += made.session.receive(Encoder(1, 1).encode(flow), made.now_s)
+    assert len(made.of(FlowSample)) == 1

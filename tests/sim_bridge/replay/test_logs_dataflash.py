@@ -12,10 +12,21 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
+from agent.config.tables import SensorsTable
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    VelocitySample,
+)
+from sim_bridge.replay.logs import open_log
 from sim_bridge.replay.logs.dataflash.records import FMT_BYTES, HEAD, LONGEST_RECORD_BYTES, RecordReader
 from sim_bridge.replay.logs.dataflash.source import CONFIRM_RECORDS
 from sim_bridge.replay.logs.events import LogError, TruthSample
+from sim_bridge.replay.logs.surveyed import OwnWords
 from tests.support.logs import FMT_OF_FMT, check_refusal, entry, fmt, read
 
 IN_ONE_FOLDER = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None, max_examples=60)
@@ -111,6 +122,36 @@ def test_the_first_barometer_gives_altitudes_of_its_pressure(
     assert [sample.t_s for sample in heights[:10]] == pytest.approx([34.0 + 0.1 * k for k in range(10)], abs=1e-6)
     assert {round(sample.altitude_m) for sample in heights} == {500}
     assert source.counts.skipped["baro: not the first one"] == 11
+
+
+def test_odometry_and_range_finders_of_a_log_are_used(tmp_path: Path) -> None:
+    # GIVEN what a companion gave the autopilot, one ignored and one of no quality, and range finders
+    velocity, finder = "QfffffB", "QBHBB"
+    described = fmt(120, "VISV", velocity, "TimeUS,VX,VY,VZ,VErr,Q,Ign") + fmt(
+        121, "RFND", finder, "TimeUS,Instance,Dist,Stat,Orient"
+    )
+    told = b"".join(
+        entry(120, velocity, 34_000_000 + 100_000 * k, 1.0, 2.0, 0.5, 0.2, quality, ignored)
+        for k, (quality, ignored) in enumerate([(50.0, 0), (-1.0, 0), (50.0, 1), (50.0, 0)])
+    ) + b"".join(
+        entry(121, finder, 34_500_000 + 100_000 * k, number, 5, status, facing)
+        for k, (number, status, facing) in enumerate([(0, 4, 25), (1, 4, 25), (0, 4, 0), (0, 3, 25)])
+    )
+    path = tmp_path / "a.BIN"
+    path.write_bytes(flight() + described + told)
+    source, events = read(path)
+    found = [event.sample for event in events if isinstance(event.sample, VelocitySample)]
+    assert [sample.velocity_mps for sample in found] == [(1.0, 2.0, 0.5)] * 2
+    assert {sample.in_body for sample in found} == {False}
+    assert found[0].sigma_mps == pytest.approx((0.2, 0.2, 0.2))
+    assert source.counts.skipped["odometry: says that it failed"] == 2
+    assert len([event for event in events if isinstance(event.sample, GroundSample)]) == 1
+    assert source.counts.skipped["ground: not the first one that looks down"] == 2
+    assert source.counts.skipped["ground: out of its reach"] == 1
+    # and none of it where it may be ours
+    ours = open_log(path, frame=source.frame, sensors=SensorsTable(), ours=OwnWords(odometry=True))
+    assert not [event for event in ours.events() if isinstance(event.sample, VelocitySample)]
+    assert ours.counts.skipped["odometry: may be ours"] == 4
 
 
 def test_attitude_is_body_to_ned(tmp_path: Path) -> None:

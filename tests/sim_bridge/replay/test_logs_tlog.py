@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 
 from agent.config.tables import SensorsTable
 from agent.mavlink.codec import Encoder, mavlink
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample
+from agent.sensing.samples import AttitudeSample, AutopilotEstimate, GpsSample, ImuSample, VelocitySample
 from sim_bridge.replay.logs import open_log
 from sim_bridge.replay.logs.events import LogError, TruthSample
 from sim_bridge.replay.logs.stamps import CONFIRM_WITHOUT_EVIDENCE, HALF_WINDOW
@@ -433,3 +433,22 @@ def test_a_missing_file_and_a_log_without_vehicle_are_refused(tmp_path: Path) ->
     path.write_bytes(tlog([(float(i), encoder.encode(gcs)) for i in range(9)]))
     with pytest.raises(LogError, match=r"9 HEARTBEAT from systems \[255\]"):
         read(path)
+
+
+def test_a_companions_velocities_are_its_vehicles_and_nobody_elses(tmp_path: Path) -> None:
+    # GIVEN velocities of the autopilot, of a companion, of our own component, and of a system without autopilot
+    records = Flight().records(0.0, 4.0)
+    vision = mavlink.MAVLink_vision_speed_estimate_message(0, 1.0, 2.0, 0.0)
+    for source in ((1, 1), (1, 191), (1, 197), (9, 191)):
+        records += [(0.1 * k, Encoder(*source).encode(vision)) for k in range(10, 30)]
+    path = tmp_path / "a.tlog"
+    path.write_bytes(tlog(sorted(records, key=lambda each: each[0])))
+    source, events = read(path)
+    found = [event for event in events if isinstance(event.sample, VelocitySample)]
+    # THEN those of the companion are used, and the others counted
+    assert [event.system_id for event in found] == [1] * 20
+    assert [event.sample.t_s for event in found] == pytest.approx([0.1 * k for k in range(10, 30)], abs=1e-3)
+    skipped = source.counts.skipped
+    assert skipped["odometry: the autopilot's own"] == 20
+    assert skipped["odometry: of our own component id"] == 20
+    assert skipped["from no autopilot"] == 20

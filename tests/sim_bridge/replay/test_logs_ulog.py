@@ -14,8 +14,19 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample
+from agent.config.tables import SensorsTable
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    VelocitySample,
+)
+from sim_bridge.replay.logs import open_log
 from sim_bridge.replay.logs.events import LogError, TruthSample
+from sim_bridge.replay.logs.surveyed import OwnWords
 from sim_bridge.replay.logs.ulog.samples import baro_samples, barometer_table
 from sim_bridge.replay.logs.ulog.tables import MAGIC, TopicTable, Unpacked, in_order
 from tests.support.logs import FRAME, check_refusal, read
@@ -174,6 +185,53 @@ def test_the_barometer_that_the_autopilot_chose_is_listened_to() -> None:
     assert barometer_table(tables) is tables["vehicle_air_data"]
     assert barometer_table({"sensor_baro": tables["sensor_baro"]}) is tables["sensor_baro"]
     assert barometer_table({}) is None
+
+
+def odometry_of(folder: Path, layout: dict[str, str], rows: list[list[float]], ours: OwnWords | None = None) -> Any:
+    """Velocities that a log with such a topic gives, and what it counted."""
+    log = Ulog()
+    log.topic("vehicle_visual_odometry", timestamp_sample="uint64_t", **layout)
+    log.topic("distance_sensor", **dict.fromkeys(("current_distance", "min_distance", "max_distance"), "float"),
+              variance="float", signal_quality="uint8_t", orientation="uint8_t")  # fmt: skip
+    for k, row in enumerate(rows):
+        log.add("vehicle_visual_odometry", 1_000_000 + 100_000 * k, 990_000 + 100_000 * k, *row)
+    told = [(5.0, 100, 25), (5.0, 100, 0), (40.0, 100, 25), (5.0, 0, 25)]
+    for k, (distance, quality, orientation) in enumerate(told):
+        log.add("distance_sensor", 1_000_000 + 100_000 * k, distance, 0.2, 30.0, 0.01, quality, orientation)
+    path = folder / "a.ulg"
+    path.write_bytes(log.bytes())
+    source = open_log(path, frame=FRAME, sensors=SensorsTable(), ours=ours or OwnWords())
+    return [event.sample for event in source.events()], source.counts
+
+
+def test_a_companions_odometry_is_read_in_the_frames_of_both_layouts(tmp_path: Path) -> None:
+    quarter = [np.sqrt(0.5), 0.0, 0.0, np.sqrt(0.5)]
+    nan = float("nan")
+    new = {"velocity": "float[3]", "velocity_variance": "float[3]", "q": "float[4]", "velocity_frame": "uint8_t"}
+    old = {"vx": "float", "vy": "float", "vz": "float", "velocity_covariance": "float[21]", "q": "float[4]",
+           "velocity_frame": "uint8_t"}  # fmt: skip
+    triangle = [0.04 if at in (0, 6, 11) else nan for at in range(21)]
+    for layout, variances, frames in ((new, [0.04] * 3, (1, 2, 3, 0)), (old, triangle, (0, 1, 3, 2))):
+        rows = [[0.0, 2.0, 0.5, *variances, *quarter, frame] for frame in frames]
+        rows.append([nan, nan, nan, *variances, *quarter, frames[0]])
+        samples, counts = odometry_of(tmp_path, layout, rows)
+        found = [sample for sample in samples if isinstance(sample, VelocitySample)]
+        assert [sample.in_body for sample in found] == [False, True, True]
+        assert found[0].velocity_mps == pytest.approx((0.0, 2.0, 0.5))
+        assert found[1].velocity_mps == pytest.approx((2.0, 0.0, 0.5), abs=1e-6)  # turned back into the body
+        assert [sample.t_s for sample in found] == pytest.approx([0.99, 1.09, 1.19])
+        assert found[0].sigma_mps == pytest.approx((0.2, 0.2, 0.2))
+        assert counts.skipped["odometry: in no frame that is known"] == 1
+        assert counts.skipped["odometry: not finite"] == 1
+    # what the autopilot was given may be ours
+    samples, counts = odometry_of(tmp_path, old, rows, OwnWords(odometry=True))
+    assert not [sample for sample in samples if isinstance(sample, VelocitySample)]
+    assert counts.skipped["odometry: may be ours"] == 5
+    # and the range finder that looks down tells distances in its reach
+    ground = [sample for sample in samples if isinstance(sample, GroundSample)]
+    assert [(sample.distance_m, sample.sigma_m) for sample in ground] == [(5.0, pytest.approx(0.1))]
+    assert counts.skipped["ground: looks elsewhere"] == 1
+    assert counts.skipped["ground: out of its reach"] == 2
 
 
 @given(st.lists(st.integers(0, 10**9), max_size=60))

@@ -22,6 +22,7 @@ from transport.messages.measurement_body import (
     Measurement,
     MeasurementKind,
     Measurements,
+    OdometryMeasurement,
     OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
@@ -76,9 +77,12 @@ antenna_speeds = st.builds(
 orientations = st.builds(OrientationMeasurement, ids, ticks, triples(numbers(3.2)), triples(numbers(60.0)))
 heights = st.builds(HeightMeasurement, ids, ticks, numbers(1e6), variances, offsets)
 ground_heights = st.builds(GroundHeightMeasurement, ids, ticks, numbers(1e6), variances, offsets)
+odometries = st.builds(
+    OdometryMeasurement, ids, ticks, triples(numbers(1e4)), triples(variances), offsets
+)
 records = st.one_of(
     positions, velocities, speeds, ranges, anchors, accelerations, tag_ranges, antenna_speeds, orientations, heights,
-    ground_heights,
+    ground_heights, odometries,
 )  # fmt: skip
 
 RANGE = RangeMeasurement(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)

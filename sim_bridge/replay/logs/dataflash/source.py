@@ -32,7 +32,7 @@ from sim_bridge.replay.logs.events import (
 from sim_bridge.replay.logs.files import opened
 from sim_bridge.replay.logs.gps_time import GpsTimeFit, unix_of_week
 from sim_bridge.replay.logs.stamps import StampRepair, without_outliers
-from sim_bridge.replay.logs.surveyed import SurveyedLog
+from sim_bridge.replay.logs.surveyed import OwnWords, SurveyedLog
 
 _SYSTEM_ID_PARAMETERS = ("SYSID_THISMAV", "MAV_SYSID")
 """The MAVLink system id, by its old and its new name."""
@@ -75,8 +75,10 @@ class DataflashSource(SurveyedLog):
 
     format: Format = "dataflash"
 
-    def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        super().__init__(path, frame, sensors)
+    def __init__(
+        self, path: Path, frame: FleetFrame | None, sensors: SensorsTable, ours: OwnWords = OwnWords()
+    ) -> None:
+        super().__init__(path, frame, sensors, ours)
         self._sim_home: GeodeticPoint | None = None
         self._imu = 0
 
@@ -84,7 +86,10 @@ class DataflashSource(SurveyedLog):
         """The samples in the order of the log."""
         (system,) = self.survey().systems.values()
         counts = self.counts = LogCounts()
-        vehicle = DataflashVehicle(self.frame, self._sensors, system, self._sim_home, counts.skipped, self._imu)
+        vehicle = DataflashVehicle(
+            self.frame, self._sensors, system, self._sim_home, counts.skipped, self._imu,
+            odometry_is_ours=self._ours.odometry,
+        )  # fmt: skip
         with closing(self._placed(counts)) as placed:
             for arrival_s, t_s, name, values in placed:
                 for sample in vehicle.samples(name, values, t_s):

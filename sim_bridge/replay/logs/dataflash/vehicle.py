@@ -13,10 +13,21 @@ from collections.abc import Callable
 
 from agent.config.tables import SensorsTable
 from agent.mavlink.boot_times import WRAP_MS_S
+from agent.mavlink.sample_adapter import GROUND_SHARE, GROUND_SIGMA_M
+from agent.mavlink.velocities import MAX_MPS, SIGMA_MPS
 from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.receivers import ReceiverChoice
-from agent.sensing.samples import AttitudeSample, AutopilotEstimate, BaroSample, GpsSample, ImuSample, Triple
+from agent.sensing.samples import (
+    AttitudeSample,
+    AutopilotEstimate,
+    BaroSample,
+    GpsSample,
+    GroundSample,
+    ImuSample,
+    Triple,
+    VelocitySample,
+)
 from sim_bridge.replay.logs.dataflash.records import Values
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 from sim_bridge.replay.logs.gps_samples import ReceiverFix, gps_sample, imu_sample
@@ -32,6 +43,8 @@ WANTED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("BARO", "BAR2", "BAR3"), ("TimeUS", "I", "Press")),
     **dict.fromkeys(("GPS", "GPS2"), _GPS),
     **dict.fromkeys(("GPA", "GPA2"), _GPA),
+    "VISV": ("TimeUS", "VX", "VY", "VZ", "VErr", "Ign", "Q"),
+    "RFND": ("TimeUS", "Instance", "Dist", "Stat", "Orient"),
     "XKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
     "NKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
     "XKF4": ("TimeUS", "PI"),
@@ -46,6 +59,8 @@ _NUMBERED = {
 SAME_INSTANT_S = 0.005
 """Records of one loop of the autopilot are stamped this close."""
 MAX_GPS_AGE_S = 5.0
+LOOKS_DOWN, RANGE_FINDER_GOOD = 25, 4
+"""ROTATION_PITCH_270, and RangeFinder's status of a distance in its reach."""
 ROUNDING_S = 0.002
 """SMS is in whole milliseconds, and may be of the very instant of the record."""
 BESIDE_S = 0.03
@@ -149,8 +164,12 @@ class DataflashVehicle:
         sim_home: GeodeticPoint | None,
         skipped: Counter[str],
         imu: int = 0,
+        *,
+        odometry_is_ours: bool = False,
     ) -> None:
+        """``odometry_is_ours``: what the autopilot was given of its velocity is no measurement."""
         self._imu_number = imu
+        self._odometry_is_ours = odometry_is_ours
         self._choice = ReceiverChoice(system.receivers)
         self._frame = frame
         self._sensors = sensors
@@ -164,6 +183,8 @@ class DataflashVehicle:
             "IMU": self._imu,
             "ATT": self._attitude,
             "BARO": self._barometer,
+            "VISV": self._odometry,
+            "RFND": self._range_finder,
             "XKF4": self._primary_lane,
             "ORGN": self._origin,
             "XKF1" if system.messages.get("XKF1") else "NKF1": self._estimate,
@@ -218,6 +239,28 @@ class DataflashVehicle:
         """BARO: the pressure in Pa. Its heights are above where the autopilot was armed."""
         altitude_m = pressure_altitude_m(values["Press"])
         return self._skip("baro: no pressure of air") if altitude_m is None else BaroSample(t_s, altitude_m)
+
+    def _odometry(self, values: Values, t_s: float) -> LogSample | None:
+        """VISV: the velocity in NED that a companion gave the autopilot, turned by its alignment of headings."""
+        velocity = (values["VX"], values["VY"], values["VZ"])
+        if self._odometry_is_ours:
+            return self._skip("odometry: may be ours")
+        if not all(map(math.isfinite, velocity)) or max(map(abs, velocity)) > MAX_MPS:
+            return self._skip("odometry: not finite or out of range")
+        if values.get("Ign") or values.get("Q", 0) < 0:
+            return self._skip("odometry: says that it failed")
+        told = values.get("VErr", math.nan)
+        sigma_mps = told if math.isfinite(told) and told > 0.0 else SIGMA_MPS
+        return VelocitySample(t_s, velocity, (sigma_mps, sigma_mps, sigma_mps), in_body=False)
+
+    def _range_finder(self, values: Values, t_s: float) -> LogSample | None:
+        """RFND: m; of several the first."""
+        if values.get("Instance", 0) or values["Orient"] != LOOKS_DOWN:
+            return self._skip("ground: not the first one that looks down")
+        distance_m = values["Dist"]
+        if values["Stat"] != RANGE_FINDER_GOOD or not 0.0 < distance_m < math.inf:
+            return self._skip("ground: out of its reach")
+        return GroundSample(t_s, distance_m, GROUND_SIGMA_M + GROUND_SHARE * distance_m)
 
     def _gps(self, values: Values, now_s: float, receiver: int) -> LogSample | None:
         point = point_of(values)

@@ -18,6 +18,7 @@ from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.components import AUTOPILOT_COMPONENT, FLAVOURS, SENSORS, Standing, speaks_for_vehicle, standing
 from agent.mavlink.sample_adapter import UNIX_US
 from agent.mavlink.utc_stamps import clocks_agree, quickest_s, unrolled
+from agent.mavlink.velocities import VELOCITY_MESSAGES
 from agent.sensing.frames import FleetFrame
 from sim_bridge.replay.logs.boot_clock import BootClockFit, LogBootClock
 from sim_bridge.replay.logs.events import (
@@ -27,6 +28,7 @@ from sim_bridge.replay.logs.events import (
     LogCounts,
     LogError,
     LogEvent,
+    LogSample,
     LogSurvey,
     SystemSurvey,
     UnixZero,
@@ -34,7 +36,7 @@ from sim_bridge.replay.logs.events import (
 from sim_bridge.replay.logs.files import opened
 from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, GpsTimeFit
 from sim_bridge.replay.logs.stamps import StampRepair, without_outliers
-from sim_bridge.replay.logs.surveyed import SurveyedLog
+from sim_bridge.replay.logs.surveyed import OwnWords, SurveyedLog
 from sim_bridge.replay.logs.telemetry.frames import Frame, FrameReader, decoded
 from sim_bridge.replay.logs.telemetry.pace import Pace, PaceSurvey
 from sim_bridge.replay.logs.telemetry.vehicle import ESTIMATES, TRUTHS, LoggedVehicle
@@ -43,6 +45,7 @@ _NAMED = {
     message_id: mavlink.mavlink_map[message_id].msgname
     for message_id in (
         *SENSORS,
+        *VELOCITY_MESSAGES,
         mavlink.MAVLINK_MSG_ID_HEARTBEAT,
         mavlink.MAVLINK_MSG_ID_SYSTEM_TIME,
         mavlink.MAVLINK_MSG_ID_LOCAL_POSITION_NED,
@@ -124,8 +127,10 @@ class TlogSource(SurveyedLog):
 
     format: Format = "tlog"
 
-    def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        super().__init__(path, frame, sensors)
+    def __init__(
+        self, path: Path, frame: FleetFrame | None, sensors: SensorsTable, ours: OwnWords = OwnWords()
+    ) -> None:
+        super().__init__(path, frame, sensors, ours)
         self._sources: dict[int, Source] = {}
         self._clocks: dict[int, LogBootClock] = {}
         self._pace: Pace | None = None
@@ -148,15 +153,20 @@ class TlogSource(SurveyedLog):
             with closing(self._placed(counts, StampRepair(counts.notes))) as placed:
                 for arrival_s, source, message_id, payload, boot_s in placed:
                     vehicle = vehicles.get(source)
+                    if message_id in VELOCITY_MESSAGES:
+                        vehicle = vehicles.get(self._sources.get(source[0], source))
                     if vehicle is None:
                         counts.skipped["from no autopilot"] += 1
                         continue
                     if boot_s is not None:
                         wrap_s = WRAP_US_S if message_id == _RAW_IMU else WRAP_MS_S
                         vehicle.on_boot_time(boot_s, arrival_s, wrap_s)
-                    if message_id not in vehicle.wanted:
-                        continue
-                    for sample in vehicle.samples(message_id, decoded(message_id, payload), arrival_s):
+                    samples: list[LogSample] = []
+                    if message_id in VELOCITY_MESSAGES:
+                        samples = self._velocities(vehicle, source, decoded(message_id, payload), arrival_s)
+                    elif message_id in vehicle.wanted:
+                        samples = vehicle.samples(message_id, decoded(message_id, payload), arrival_s)
+                    for sample in samples:
                         event = LogEvent(arrival_s, source[0], sample)
                         counts.count(event)
                         yield event
@@ -165,6 +175,18 @@ class TlogSource(SurveyedLog):
                 counts.skipped.update(vehicle.skipped)
                 counts.notes.update(vehicle.noted)
             counts.notes.update(self._clock_notes)
+
+    def _velocities(
+        self, vehicle: LoggedVehicle, source: Source, message: Message, arrival_s: float
+    ) -> list[LogSample]:
+        """What a component says of its vehicle's velocity; our own words are nobody's."""
+        component, of_autopilot = source[1], source == self._sources[source[0]]
+        if component == self._ours.component_id:
+            self.counts.skipped["odometry: of our own component id"] += 1
+            return []
+        of_autopilot = of_autopilot or component == AUTOPILOT_COMPONENT
+        sample = vehicle.velocity(message, arrival_s, component, of_autopilot=of_autopilot)
+        return [] if sample is None else [sample]
 
     def _placed(self, counts: LogCounts, repair: StampRepair) -> Generator[Placed, None, None]:
         """The wanted messages with their log times; those with stamps that are not believed are left out."""

@@ -16,8 +16,17 @@ from agent.mavlink.boot_times import WRAP_MS_S
 from agent.mavlink.codec import Message, mavlink
 from agent.mavlink.components import SENSORS
 from agent.mavlink.sample_adapter import SampleAdapter
+from agent.mavlink.velocities import VelocityAdapter
 from agent.sensing.frames import FleetFrame, from_euler, normalised
-from agent.sensing.samples import AutopilotEstimate, BaroSample, Quaternion, RangeSample, Triple
+from agent.sensing.samples import (
+    AutopilotEstimate,
+    BaroSample,
+    FlowSample,
+    Quaternion,
+    RangeSample,
+    Triple,
+    VelocitySample,
+)
 from sim_bridge.replay.logs.boot_clock import LogBootClock
 from sim_bridge.replay.logs.events import GeodeticPoint, LogSample, SystemSurvey, TruthSample
 
@@ -39,6 +48,7 @@ class LoggedVehicle:
         self._clock = clock
         self._adapter = SampleAdapter(frame, sensors, epoch_unix_s, clock.log_s, found.receivers)
         self._adapter.flavour = found.flavour
+        self._velocities = VelocityAdapter(epoch_unix_s, clock.log_s)
         self._session = -1
         self._boot: tuple[float, float, float] | None = None
         self._origin_m = None if found.origin is None else self._ned(found.origin)
@@ -63,7 +73,7 @@ class LoggedVehicle:
     @property
     def skipped(self) -> Counter[str]:
         """Messages that gave no sample, by reason."""
-        return self._adapter.skipped + self._skipped
+        return self._adapter.skipped + self._velocities.skipped + self._skipped
 
     @property
     def noted(self) -> Counter[str]:
@@ -77,6 +87,7 @@ class LoggedVehicle:
         if session != self._session:
             if self._session >= 0:
                 self._adapter.reset()
+                self._velocities.reset()
             self._session = session
 
     def samples(self, message_id: int, message: Message, arrival_s: float) -> list[LogSample]:
@@ -85,6 +96,12 @@ class LoggedVehicle:
         assert beside is None or isinstance(beside, BaroSample)
         both = self._sample(message_id, message, arrival_s), beside
         return [sample for sample in both if sample is not None]
+
+    def velocity(
+        self, message: Message, arrival_s: float, component: int, *, of_autopilot: bool
+    ) -> VelocitySample | FlowSample | None:
+        """What a component of the vehicle says of a velocity."""
+        return self._velocities.convert(message, arrival_s, component, of_autopilot=of_autopilot)
 
     def _sample(self, message_id: int, message: Message, arrival_s: float) -> LogSample | None:
         converter = self._converters.get(message_id)

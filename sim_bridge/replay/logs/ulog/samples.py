@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from agent.config.tables import SensorsTable
+from agent.mavlink.sample_adapter import GROUND_SHARE, GROUND_SIGMA_M
 from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, normalised
 from agent.sensing.receivers import ReceiverChoice
@@ -23,6 +24,7 @@ from agent.sensing.samples import (
     AutopilotEstimate,
     BaroSample,
     GpsSample,
+    GroundSample,
     ImuSample,
     Quaternion,
     Triple,
@@ -40,6 +42,8 @@ _BIAS = ("accel_bias[0]", "accel_bias[1]", "accel_bias[2]", "gyro_bias[0]", "gyr
 LARGEST_BIAS_MPS2 = 1.0
 """What PX4's filter says beyond this is no bias (its own limit is 0.4)."""
 FIX_3D = 3
+LOOKS_DOWN = 25
+"""ROTATION_DOWNWARD_FACING, as MAV_SENSOR_ROTATION_PITCH_270."""
 _MOTION = ("x", "y", "z", "vx", "vy", "vz")
 _REFERENCE = ("ref_lat", "ref_lon", "ref_alt")
 _GPS = (
@@ -57,9 +61,12 @@ WANTED: dict[str, tuple[str, ...]] = {
     "vehicle_attitude_groundtruth": _QUATERNION,
     "vehicle_air_data": ("timestamp_sample", "baro_pressure_pa"),
     "sensor_baro": ("timestamp_sample", "pressure"),
+    "distance_sensor": (
+        "current_distance", "min_distance", "max_distance", "variance", "signal_quality", "orientation",
+    ),
     "timesync_status": ("remote_timestamp", "observed_offset"),
     **dict.fromkeys(GPS_TOPICS, _GPS),
-}
+}  # fmt: skip
 ROWS = 1024
 MAX_AGE_US = 5_000_000
 """A value older than this at its publication has a wrong stamp."""
@@ -81,7 +88,7 @@ def _sample_times_us(table: TopicTable) -> NDArray[np.int64]:
     return np.where((age >= 0) & (age <= MAX_AGE_US), taken, table.timestamp_us)
 
 
-def _rows(table: TopicTable, values: NDArray[np.float64]) -> Iterator[tuple[float, float, list[float]]]:
+def rows_of(table: TopicTable, values: NDArray[np.float64]) -> Iterator[tuple[float, float, list[float]]]:
     """Publication, instant of the value (log time in s) and values, a few rows in Python's own types at a time."""
     taken_us = _sample_times_us(table)
     for start in range(0, len(table), ROWS):
@@ -107,7 +114,7 @@ def imu_samples(
         return
     if biases is not None:
         values = values - _biases_at(table, biases)
-    for arrival_s, t_s, row in _rows(table, values):
+    for arrival_s, t_s, row in rows_of(table, values):
         sample = imu_sample(t_s, (row[0], row[1], row[2]), (row[3], row[4], row[5]), "px4", sensors)
         if isinstance(sample, ImuSample):
             yield arrival_s, sample
@@ -134,7 +141,7 @@ def attitude_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed
     if values is None:
         skipped["vehicle_attitude: fields missing"] += len(table)
         return
-    for arrival_s, t_s, row in _rows(table, values):
+    for arrival_s, t_s, row in rows_of(table, values):
         quaternion = _unit(row)
         if quaternion is None:
             skipped["attitude: no unit quaternion"] += 1
@@ -153,12 +160,31 @@ def baro_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed]:
     if values is None:
         skipped[f"{table.name}: fields missing"] += len(table)
         return
-    for arrival_s, t_s, (pressure,) in _rows(table, values):
+    for arrival_s, t_s, (pressure,) in rows_of(table, values):
         altitude_m = pressure_altitude_m(pressure)
         if altitude_m is None:
             skipped["baro: no pressure of air"] += 1
         else:
             yield arrival_s, BaroSample(t_s, altitude_m)
+
+
+def ground_samples(table: TopicTable, skipped: Counter[str]) -> Iterator[Timed]:
+    """``distance_sensor`` of a range finder that looks down: m, its variance m2."""
+    values = table.stack("current_distance", "min_distance", "max_distance", "orientation")
+    if values is None:
+        skipped["distance_sensor: fields missing"] += len(table)
+        return
+    told = [table.columns.get(name, np.full(len(table), -1.0)) for name in ("variance", "signal_quality")]
+    values = np.column_stack((values, *(np.asarray(column, np.float64) for column in told)))
+    for arrival_s, t_s, (distance_m, least_m, most_m, orientation, variance, quality) in rows_of(table, values):
+        if orientation != LOOKS_DOWN:
+            skipped["ground: looks elsewhere"] += 1
+        elif not (math.isfinite(distance_m) and least_m < distance_m < most_m and quality != 0.0):
+            skipped["ground: out of its reach"] += 1
+        else:
+            known = math.isfinite(variance) and variance > 0.0
+            sigma_m = math.sqrt(variance) if known else GROUND_SIGMA_M + GROUND_SHARE * distance_m
+            yield arrival_s, GroundSample(t_s, distance_m, sigma_m)
 
 
 def fixes_of(table: TopicTable) -> int:
@@ -201,7 +227,7 @@ def _fixes(
     )  # fmt: skip
     columns = [table.columns.get(name, np.full(len(table), np.nan)) for name in others]
     values = np.column_stack((where, *(np.asarray(column, np.float64) for column in columns)))
-    for arrival_s, t_s, row in _rows(table, values):
+    for arrival_s, t_s, row in rows_of(table, values):
         fix = ReceiverFix(
             t_s=t_s,
             fix_type=int(row[4]),
@@ -242,7 +268,7 @@ def estimate_samples(table: TopicTable, frame: FleetFrame, skipped: Counter[str]
         skipped["vehicle_local_position: fields missing"] += len(table)
         return
     shifts = _shifts(values[:, 6:], frame)
-    for arrival_s, t_s, row in _rows(table, values):
+    for arrival_s, t_s, row in rows_of(table, values):
         if not all(map(math.isfinite, row[:6])):
             skipped["autopilot estimate: not finite"] += 1
             continue
@@ -266,7 +292,7 @@ def truth_samples(
         return
     quaternions = _beside(table, attitude)
     shifts = _shifts(values[:, 6:], frame)
-    for arrival_s, t_s, row in _rows(table, np.column_stack((values, quaternions))):
+    for arrival_s, t_s, row in rows_of(table, np.column_stack((values, quaternions))):
         shift = shifts.get((row[6], row[7], row[8]))
         if shift is None or not all(map(math.isfinite, row[:6])):
             skipped["truth: not finite or no place"] += 1

@@ -24,7 +24,8 @@ from sim_bridge.replay.logs.events import (
     UnixZero,
 )
 from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted, since_earliest
-from sim_bridge.replay.logs.surveyed import SurveyedLog
+from sim_bridge.replay.logs.surveyed import OwnWords, SurveyedLog
+from sim_bridge.replay.logs.ulog.odometry import FIELDS, VISUAL_ODOMETRY, odometry_samples
 from sim_bridge.replay.logs.ulog.samples import (
     FIX_3D,
     GPS_TOPICS,
@@ -37,6 +38,7 @@ from sim_bridge.replay.logs.ulog.samples import (
     degrees,
     estimate_samples,
     fixes_of,
+    ground_samples,
     has_fixes,
     imu_samples,
     truth_samples,
@@ -54,8 +56,10 @@ class UlogSource(SurveyedLog):
 
     format: Format = "ulog"
 
-    def __init__(self, path: Path, frame: FleetFrame | None, sensors: SensorsTable) -> None:
-        super().__init__(path, frame, sensors)
+    def __init__(
+        self, path: Path, frame: FleetFrame | None, sensors: SensorsTable, ours: OwnWords = OwnWords()
+    ) -> None:
+        super().__init__(path, frame, sensors, ours)
         self._loaded: Tables | None = None
         self._damage: Counter[str] = Counter()
 
@@ -72,6 +76,10 @@ class UlogSource(SurveyedLog):
                 streams.append(imu_samples(table, biases, self._sensors, skipped))
             elif table is barometer_table(tables.topics):
                 streams.append(baro_samples(table, skipped))
+            elif name == "distance_sensor":
+                streams.append(ground_samples(table, skipped))
+            elif name == VISUAL_ODOMETRY:
+                streams.append(odometry_samples(table, skipped, may_be_ours=self._ours.odometry))
             elif name == "vehicle_attitude":
                 streams.append(attitude_samples(table, skipped))
             elif name == "vehicle_local_position":
@@ -88,7 +96,8 @@ class UlogSource(SurveyedLog):
     def _tables(self) -> Tables:
         if self._loaded is None:
             self._damage.clear()
-            self._loaded = load_tables(self.path, WANTED, self._damage, several=GPS_TOPICS)
+            wanted = {**WANTED, VISUAL_ODOMETRY: FIELDS}
+            self._loaded = load_tables(self.path, wanted, self._damage, several=GPS_TOPICS)
         return self._loaded
 
     def _made_survey(self) -> LogSurvey:

@@ -1,0 +1,1 @@
+"""Companion computers on the links of simulated autopilots, and what their sensors say."""

@@ -145,15 +145,18 @@ def _anchors(config: FleetConfig) -> Iterator[Fault]:
 
 
 def _uwb_pairs(config: FleetConfig) -> Iterator[Fault]:
-    seen: set[frozenset[int]] = set()
+    seen: set[frozenset[tuple[int, int | None]]] = set()
     for index, each in enumerate(config.sensors.uwb_pairs):
         key, pair = f"sensors.uwb_pairs[{index}].pair", frozenset(each.pair)
         yield from unknown_ids(config, key, set(each.pair) - config.places_m.keys())
         if len(pair) < 2:
             yield Fault(key, "two different agents", f"{list(each.pair)}")
-        if pair in seen:
-            yield Fault(key, "each pair once", f"a second entry of {sorted(pair)}")
-        seen.add(pair)
+        ends = frozenset(zip(each.pair, each.tags or (None, None), strict=True))
+        if ends in seen:
+            found = f"a second entry of {sorted(pair)}"
+            found += "" if each.tags is None else f" with tags {list(each.tags)}"
+            yield Fault(key, "each pair once, or once for each two tags", found)
+        seen.add(ends)
 
 
 def _edges(config: FleetConfig) -> Iterator[Fault]:

@@ -119,6 +119,9 @@ class MavlinkTable(Table, frozen=True):
     ones; off is refused there unless the link is serial or on loopback."""
 
 
+UwbTag = Annotated[int, msgspec.Meta(ge=0, lt=MAX_TAGS)]
+
+
 class UwbPair(Table, frozen=True):
     """``[[sensors.uwb_pairs]]``: what calibration found of the ranges of two drones; `fleetloc ranges` writes it."""
 
@@ -126,6 +129,8 @@ class UwbPair(Table, frozen=True):
     """Two drones, whoever measures."""
     bias_m: Annotated[float, msgspec.Meta(ge=-10, le=10)]
     """How much too long their ranges are; it is subtracted."""
+    tags: tuple[UwbTag, UwbTag] | None = None
+    """Between which of their antennas, in the order of ``pair``; absent = all that have no entry of their own."""
     sigma_m: Positive | None = None
     """1-sigma of a range between them whose driver gives none; absent = ``uwb_sigma_m``."""
 

@@ -89,7 +89,8 @@ class MeasurementStore:
         self._history_ticks = config.transport.history_ticks
         self._hold_ticks = config.estimator.window
         self.neighbourhood = Neighbourhood(config, agent_id)
-        self._arms = LeverArms(config)
+        self.arms = LeverArms(config)
+        """The antennas of all drones, and how the drones lay of late."""
         self._acked: dict[int, dict[bytes, _Kept]] = {}
         """By tick, what is kept by what acknowledges it."""
         self._kept: dict[int, dict[bytes, _Kept]] = {}
@@ -187,13 +188,13 @@ class MeasurementStore:
         for push in self._inputs:
             (inputs if push.tick < tick and push.observer in slots else later_inputs).append(push)
         self._rows, self._inputs = later, later_inputs
-        table = rows_of(rows, slots, self._arms)
+        table = rows_of(rows, slots, self.arms)
         self.forget(tick)
         return table, inputs_of(inputs, slots)
 
     def _is_turned(self, record: Measurement, tick: int) -> bool:
         """Whether it is known how the ends of a range lay, or it has waited for that long enough."""
-        if not isinstance(record, RangeMeasurement) or self._arms.knows(record):
+        if not isinstance(record, RangeMeasurement) or self.arms.knows(record):
             return True
         waited = tick - record.tick >= min(ATTITUDE_TICKS, self._hold_ticks)
         self.unturned += waited
@@ -218,7 +219,7 @@ class MeasurementStore:
             self._count_ranges(record for record in self._rows if record.tick < first)
         self._rows = waiting
         self._inputs = [record for record in self._inputs if record.tick >= first]
-        self._arms.forget(first)
+        self.arms.forget(first)
         for old in [t for t in self._kept if t < tick - KEEP_TICKS]:
             self._kept.pop(old)
             self._acked.pop(old, None)
@@ -351,7 +352,7 @@ class MeasurementStore:
         if isinstance(record, AccelerationMeasurement):
             self._inputs.append(record)
         elif isinstance(record, OrientationMeasurement):
-            self._arms.note(record)
+            self.arms.note(record)
         else:
             self._rows.append(record)
         return kept

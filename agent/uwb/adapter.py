@@ -6,7 +6,7 @@ from collections import Counter
 from collections.abc import Collection, Mapping
 from dataclasses import replace
 
-from agent.config.tables import SensorsTable
+from agent.config.tables import SensorsTable, UwbPair
 from agent.sensing.samples import RangeSample
 from transport.messages.uwb_body import MAX_TAGS, UwbFrame, UwbIntake, UwbRange
 
@@ -34,8 +34,8 @@ class UwbAdapter:
         self._observer = observer
         self._others = frozenset(others)
         self._sensors = sensors
-        self._pairs = {sum(each.pair) - observer: each for each in sensors.uwb_pairs if observer in each.pair}
-        """What calibration found, by the other drone."""
+        self._pairs = {_seen_from(observer, each): each for each in sensors.uwb_pairs if observer in each.pair}
+        """What calibration found, by the other drone, and by the own antenna and the other's where it is of these."""
         self.intake = UwbIntake(observer, max_age_s=MAX_AGE_S)
         self.skipped: Counter[str] = Counter()
         """Ranges left out, by reason; `intake` counts refused frames."""
@@ -60,7 +60,7 @@ class UwbAdapter:
 
     def _calibrated(self, entry: UwbRange) -> UwbRange | None:
         """The range less its pair's bias; one that is then none is left out."""
-        known = self._pairs.get(entry.other)
+        known = self._pairs.get((entry.other, (entry.tag, entry.other_tag))) or self._pairs.get((entry.other, None))
         if known is None:
             return entry
         if entry.range_m <= known.bias_m:
@@ -96,3 +96,11 @@ class UwbAdapter:
     def _skip(self, reason: str) -> RangeSample | None:
         self.skipped[reason] += 1
         return None
+
+
+def _seen_from(observer: int, pair: UwbPair) -> tuple[int, tuple[int, int] | None]:
+    """The other drone of a pair, and the antennas that its calibration is of, the observer's first."""
+    other = sum(pair.pair) - observer
+    if pair.tags is None or pair.pair[0] == observer:
+        return other, pair.tags
+    return other, (pair.tags[1], pair.tags[0])

@@ -12,10 +12,12 @@ from numpy.typing import NDArray
 
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, write_json
-from fleetloc.report.pair_calibration import CalibratedPair, write_lines
+from fleetloc.report.pair_calibration import CalibratedPair, name_of, write_lines
 from sim_bridge.replay.side_files.range_files import RangeCounts, read_ranges
 
 Floats = NDArray[np.float64]
+Antennas = tuple[tuple[int, int], tuple[int, int]]
+"""Drone and tag of both ends, the lower ones first."""
 NORMAL_OF_MAD = 1.4826
 """1-sigma of a normal distribution by its median absolute deviation."""
 MEDIAN_OF_NORMAL = math.sqrt(math.pi / 2.0)
@@ -24,13 +26,14 @@ MEDIAN_OF_NORMAL = math.sqrt(math.pi / 2.0)
 
 @dataclass(frozen=True, slots=True)
 class PairFigures:
-    """Errors (measured less true, m) of one pair, whoever measured.
+    """Errors (measured less true, m) of one pair, whoever measured, or of two of its antennas (``tags``).
 
     ``sigma_m`` is robust: 1.4826 times the median distance from the median. ``outliers`` is the share that lies
     further than a limit from the pair's median.
     """
 
     pair: tuple[int, int]
+    tags: tuple[int, int] | None
     count: int
     bias_m: float
     median_m: float
@@ -41,13 +44,16 @@ class PairFigures:
     worst_m: float
 
 
-def pair_figures(pair: tuple[int, int], errors_m: Floats, outlier_m: float) -> PairFigures:
+def pair_figures(
+    pair: tuple[int, int], errors_m: Floats, outlier_m: float, tags: tuple[int, int] | None = None
+) -> PairFigures:
     """Figures of the errors ``(K,)`` of one pair, K at least 1."""
     median_m = float(np.median(errors_m))
     off_m = np.abs(errors_m - median_m)
     sigma_m = NORMAL_OF_MAD * float(np.median(off_m))
     return PairFigures(
         pair=pair,
+        tags=tags,
         count=len(errors_m),
         bias_m=float(errors_m.mean()),
         median_m=median_m,
@@ -79,16 +85,20 @@ def study_ranges(
     Raises `InputError` or `ReplayError` for a file without ranges or without true distances.
     """
     counts = RangeCounts()
-    errors: dict[tuple[int, int], list[float]] = {}
+    errors: dict[Antennas, list[float]] = {}
     for line in read_ranges(file, counts):
         if line.true_m is None:
             counts.skipped["no true distance"] += 1
             continue
-        pair = min(line.observer, line.target), max(line.observer, line.target)
-        errors.setdefault(pair, []).append(line.range_m - line.true_m)
+        ends = (line.observer, line.tag), (line.target, line.other_tag)
+        errors.setdefault((min(ends), max(ends)), []).append(line.range_m - line.true_m)
     if not errors:
         raise InputError(str(file), "true_m", "a column of true distances (true_m, mocap_range or truth)", "none")
-    pairs = [pair_figures(pair, np.array(values), outlier_m) for pair, values in sorted(errors.items())]
+    several = {pair for pair in map(_pair, errors) if sum(_pair(each) == pair for each in errors) > 1}
+    pairs = [
+        pair_figures(_pair(ends), np.array(values), outlier_m, _tags(ends) if _pair(ends) in several else None)
+        for ends, values in sorted(errors.items())
+    ]
     figures = {
         "file": file.name,
         "lines_read": counts.read,
@@ -98,6 +108,7 @@ def study_ranges(
         "pairs": [
             {
                 "pair": list(one.pair),
+                "tags": None if one.tags is None else list(one.tags),
                 "count": one.count,
                 "bias_m": one.bias_m,
                 "median_m": one.median_m,
@@ -113,10 +124,19 @@ def study_ranges(
         "robust_sigma_median_m": float(np.median([one.sigma_m for one in pairs])),
     }
     _print(figures, pairs, counts)
-    write_lines((CalibratedPair(p.pair, p.count, p.median_m, p.median_sigma_m, p.sigma_m) for p in pairs), write)
+    found = (CalibratedPair(p.pair, p.count, p.median_m, p.median_sigma_m, p.sigma_m, p.tags) for p in pairs)
+    write_lines(found, write)
     if json_file is not None:
         write_json(json_file, figures)
     return figures
+
+
+def _pair(ends: Antennas) -> tuple[int, int]:
+    return ends[0][0], ends[1][0]
+
+
+def _tags(ends: Antennas) -> tuple[int, int]:
+    return ends[0][1], ends[1][1]
 
 
 def _of_all(figures: dict[str, Any]) -> list[str]:
@@ -129,7 +149,7 @@ def _print(figures: dict[str, Any], pairs: list[PairFigures], counts: RangeCount
     columns = ["pair", "ranges", "bias m", "median m", "+- m", "robust sigma m", limit, "worst m"]
     rows = [
         [
-            f"{one.pair[0]} - {one.pair[1]}",
+            name_of(one.pair, one.tags),
             str(one.count),
             f"{one.bias_m:+.3f}",
             f"{one.median_m:+.3f}",

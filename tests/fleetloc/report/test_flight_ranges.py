@@ -104,6 +104,65 @@ def test_a_pair_that_is_none_is_named(pairs: list[list[int]], fault: str) -> Non
         three(sensors={"uwb_pairs": [{"pair": pair, "bias_m": 0.1} for pair in pairs]})
 
 
+def test_antennas_of_a_pair_may_each_have_their_own(tmp_path: Path) -> None:
+    # GIVEN a pair of which one drone has two tags, as a file of ranges with true distances shows
+    csv = tmp_path / "ranges.csv"
+    rows = [
+        f"{0.1 * k},{one},{other},{10.0 + bias_m + 0.01 * (k % 3 - 1)},10.0,{tag},{other_tag}"
+        for k in range(30)
+        for one, other, tag, other_tag, bias_m in ((1, 2, 0, 0, 0.3), (2, 1, 1, 0, 0.1), (1, 3, 0, 0, -0.2))
+    ]
+    csv.write_text("\n".join(["time,observer,target,range_m,true_m,tag,other_tag", *rows]))
+    assert main(["ranges", str(csv), "--write", str(tmp_path / "lines.toml")]) == 0
+    # WHEN the lines go into the configuration THEN each range is less what its antennas have
+    document = tomllib.loads((tmp_path / "lines.toml").read_text())
+    config = three(**document)
+    assert [(each.pair, each.tags, each.bias_m) for each in config.sensors.uwb_pairs] == [
+        ((1, 2), (0, 0), pytest.approx(0.3)),
+        ((1, 2), (0, 1), pytest.approx(0.1)),
+        ((1, 3), None, pytest.approx(-0.2)),
+    ]
+    for observer, entry, expected_m in (
+        (1, UwbRange(2, 10.3), 10.0),
+        (1, UwbRange(2, 10.1, other_tag=1), 10.0),
+        (2, UwbRange(1, 10.1, tag=1), 10.0),
+        (2, UwbRange(1, 10.1, tag=1, other_tag=1), 10.1),  # of which nothing is known
+        (1, UwbRange(3, 9.8, tag=4), 10.0),
+    ):
+        payload = encode_uwb_json(UwbFrame(1, "mono", 10**9, (entry,), observer))
+        adapter = UwbAdapter(observer, config.ids, config.sensors)
+        (sample,) = adapter.receive(payload, now_s=1.0, host_s=1.0, unix_s=0.0)
+        assert sample.range_m == pytest.approx(expected_m)
+    ends = ([1, 2], [0, 1]), ([2, 1], [1, 0])
+    twice = [{"pair": pair, "tags": tags, "bias_m": 0.1} for pair, tags in ends]
+    with pytest.raises(Exception, match="once for each two tags"):
+        three(sensors={"uwb_pairs": twice})
+
+
+@pytest.mark.slow
+def test_a_flight_tells_the_biases_of_each_antenna(tmp_path: Path) -> None:
+    # GIVEN a flight of drones of which one has two tags, 0.4 m apart
+    tags = [[0.0, 0.2, 0.0], [0.0, -0.2, 0.0]]
+    agents = [
+        {"id": i, "mavlink": f"udpin:127.0.0.1:{14550 + i}", **({"uwb_tags_m": tags} if i == 3 else {})}
+        for i in (1, 2, 3)
+    ]
+    fleet = RecordedFleet(three(agents=agents), tmp_path)
+    fleet.lockstep.run(14.0)
+    for record in fleet.records.values():
+        record.close()
+    # WHEN one log is looked at THEN there is a line for each antenna, and they agree, as the simulator's tags do
+    found = study_flight_logs([tmp_path / "agent_001.mcap"], None, None)
+    assert [(each.pair, each.tags) for each in found] == [
+        ((1, 2), None), ((1, 3), (0, 0)), ((1, 3), (0, 1)), ((2, 3), None),
+    ]  # fmt: skip
+    first, second = found[1], found[2]
+    assert abs(first.bias_m - second.bias_m) < 0.1
+    assert first.count > 30
+    assert first.sigma_m is not None
+    assert 0.03 < first.sigma_m < 0.4
+
+
 def test_the_medians_own_sigma_counts_what_follows_each_other_as_fewer() -> None:
     # GIVEN white errors, and such that keep 0.9 of themselves from one to the next; many sets of each
     rng, count = np.random.default_rng(1), 400

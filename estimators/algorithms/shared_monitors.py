@@ -103,6 +103,7 @@ class SharedMonitors:
         self._slot = slot
         self._period_s = period_s
         self._norm_smoothing = norm_smoothing
+        self._vehicles = layout.is_vehicle
         self._observability = ObservabilityMonitor(layout.size)
         self._mirror = FleetMirrorMonitor()
         self._ambiguities = [
@@ -134,7 +135,7 @@ class SharedMonitors:
             observable[finding.about] = False
         mirror, moves = self._mirror.observe(window), 0
         if has(mirror, What.REVERSED):
-            belief, moves = _reversed(belief), 1
+            belief, moves = _reversed(belief, self._vehicles), 1
         covariance, elsewhere = belief.covariance, None
         found_again: dict[int, Matrix] = {}
         before, rival = rivals
@@ -190,6 +191,7 @@ class SharedMonitors:
             belief.arrival.mean,
             belief.arrival.information,
             slide,
+            self._vehicles,
             problem.period_s,
             self._norm_smoothing,
         )
@@ -236,7 +238,7 @@ class SharedMonitors:
         self, change: MemberChange, fresh: Mapping[int, Body], limits: StateLimits | None = None
     ) -> None:
         """Go on with another fleet, its limits; ``fresh``: the states, at the last tick, of those that begin anew."""
-        self._slot = change.own
+        self._slot, self._vehicles = change.own, change.after.is_vehicle
         self._observability.change_members(change)
         monitors = []
         for slot in range(change.after.size):
@@ -287,9 +289,10 @@ def understated(covered: Matrix, covariance: Matrix) -> NDArray[np.bool_]:
     return np.asarray(expected > np.maximum(FLOOR_M**2, UNDERSTATED * claimed))
 
 
-def _reversed(belief: Belief) -> Belief:
-    """The mirror image of a belief."""
-    _, covariance = mirrored(belief.path[-1], belief.covariance)
-    arrival = InformationState.from_moments(*mirrored(belief.arrival.mean, belief.arrival.covariance()))
-    path = np.array([state + mirror_offset(state) for state in belief.path])
+def _reversed(belief: Belief, vehicles: NDArray[np.bool_]) -> Belief:
+    """The mirror image of a belief, in the plane of ``vehicles`` ``(n,)``."""
+    _, covariance = mirrored(belief.path[-1], belief.covariance, vehicles)
+    before = belief.arrival
+    arrival = InformationState.from_moments(*mirrored(before.mean, before.covariance(), vehicles))
+    path = np.array([state + mirror_offset(state, vehicles) for state in belief.path])
     return Belief(path, covariance, arrival, None if belief.errors is None else belief.errors.apart())

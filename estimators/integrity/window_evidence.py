@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
+from numpy.typing import NDArray
+
 from estimators.model.measurements import Matrix, RowTable, Vector
 from estimators.model.row_kernels import IntArray
 
@@ -25,6 +28,8 @@ class WindowEvidence:
     """``(6n,)``, ``(6n, 6n)``: what the estimator carries into the next window."""
     slide: bool
     """Whether the next window starts one tick later: then the first tick's rows have been used for good."""
+    vehicles: NDArray[np.bool_]
+    """``(n,)`` which bodies are the fleet's own."""
     period_s: float
     norm_smoothing: float
     """See `estimators.settings.EstimatorSettings.norm_smoothing_m`."""

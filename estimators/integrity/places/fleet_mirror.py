@@ -10,6 +10,9 @@ never higher than what the estimate, of covariance P, left of the two at the clo
 
 and every fix adds the difference of its log likelihoods at x and at x'. Measured velocities are left out: on the
 wrong side a fleet is turned to fit its fixes, and so is its image.
+
+The fleet are its vehicles. Targets have the image that ranges from the vehicles give them, and have no say in where
+the plane is or how well it is known: one that is left behind, of which little is known, says nothing of the fleet.
 """
 
 from __future__ import annotations
@@ -31,10 +34,12 @@ from estimators.integrity.thresholds import (
     UNDERSTATED,
 )
 from estimators.integrity.window_evidence import WindowEvidence
-from estimators.model.gaussian import symmetrised
-from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.gaussian import marginal_pair, symmetrised
+from estimators.model.layout import STATES_PER_AGENT, states_of
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
 from estimators.model.row_kernels import ANCHOR_RANGE, POSITION, PRECISION, VALUE, IntArray, encode_rows, predict_row
+
+Mask = NDArray[np.bool_]
 
 TURN_RAD = 0.3
 """1-sigma about each axis by which a fleet that was taken for its mirror image is turned, to fit the fixes better."""
@@ -78,54 +83,60 @@ class FleetMirrorMonitor:
         estimate is expected to be the image (`mirrored`), with the odds for it that were against it.
         """
         path, rows, start, eps = evidence.path, evidence.rows, evidence.start, evidence.norm_smoothing
-        if path.shape[1] < FEWEST_MIRRORED * STATES_PER_AGENT:
+        fleet = evidence.vehicles
+        if np.count_nonzero(fleet) < FEWEST_MIRRORED:
             return ()
         if evidence.slide:
-            self._weigh(rows[: start[1]], path[0], eps)
-        self._pass_by(evidence.arrival_mean, evidence.arrival_information)
+            self._weigh(rows[: start[1]], path[0], fleet, eps)
+        self._pass_by(evidence.arrival_mean, evidence.arrival_information, fleet)
         if self._lead_nats < -DECISIVE_NATS:
             self._lead_nats = -self._lead_nats
             return (Finding(What.REVERSED, Gravity.NOTED, value=self._lead_nats, limit=DECISIVE_NATS),)
         weighed = 1 if evidence.slide else 0
-        return self._doubt(rows, start[weighed:], path[weighed:], eps)
+        return self._doubt(rows, start[weighed:], path[weighed:], fleet, eps)
 
-    def _weigh(self, rows: RowTable, state: Vector, eps: float) -> None:
+    def _weigh(self, rows: RowTable, state: Vector, fleet: Mask, eps: float) -> None:
         """Use rows ``(m,)`` of one tick, at the estimate ``(6n,)`` of that tick; each row once.
 
         What was certain stays so until the fleet comes near a plane: it cannot have changed sides. The errors of
         fixes last, and a minute of them must not add up to another opinion.
         """
         if len(rows) and self._lead_nats < CERTAIN_NATS:
-            gained = likelihood_ratio(rows, state, state + mirror_offset(state), eps)
+            gained = likelihood_ratio(rows, state, state + mirror_offset(state, fleet), eps)
             self._lead_nats = min(self._lead_nats + gained, CERTAIN_NATS)
 
-    def _pass_by(self, state: Vector, information: Matrix) -> None:
+    def _pass_by(self, state: Vector, information: Matrix, fleet: Mask) -> None:
         """Know no more than an estimate ``(6n,)`` with its information ``(6n, 6n)`` tells of the two."""
-        offset = mirror_offset(state)
+        offset, slots = mirror_offset(state, fleet), np.flatnonzero(fleet).tolist()
+        if len(slots) < len(fleet):
+            information, offset = marginal_pair((information, offset), slots)[0], offset[states_of(slots)]
         self._lead_nats = min(self._lead_nats, 0.5 * CREDIT * float(offset @ information @ offset))
 
-    def _doubt(self, rows: RowTable, start: IntArray, path: Matrix, eps: float) -> tuple[MirrorImage, ...]:
+    def _doubt(
+        self, rows: RowTable, start: IntArray, path: Matrix, fleet: Mask, eps: float
+    ) -> tuple[MirrorImage, ...]:
         """The mirror image of the newest state, unless it can be neglected; ``path`` are those not weighed yet."""
         lead_nats = self._lead_nats
         if lead_nats >= SURE_NATS:
             return ()
         for k, there in enumerate(path):
-            lead_nats += likelihood_ratio(rows[start[k] : start[k + 1]], there, there + mirror_offset(there), eps)
+            image = there + mirror_offset(there, fleet)
+            lead_nats += likelihood_ratio(rows[start[k] : start[k + 1]], there, image, eps)
         if lead_nats >= SURE_NATS:
             return ()
         probability = float(1.0 / (1.0 + np.exp(max(lead_nats, -CERTAIN_NATS))))
-        image = MirrorImage(What.MIRRORED, Gravity.ALARM, value=probability, offset=mirror_offset(path[-1]))
-        return (image,)
+        offset = mirror_offset(path[-1], fleet)
+        return (MirrorImage(What.MIRRORED, Gravity.ALARM, value=probability, offset=offset),)
 
 
-def mirror_offset(state: Vector) -> Vector:
-    """From a fleet's state ``(6n,)`` to that of its image in the plane that its positions are closest to.
+def mirror_offset(state: Vector, fleet: Mask) -> Vector:
+    """From a state ``(6n,)`` to its image in the plane that the positions of the ``fleet`` ``(n,)`` are closest to.
 
     The centre of the fleet stays where it is and goes on as it did.
     """
     vectors = state.reshape(-1, 2, 3)
-    about = vectors - vectors.mean(axis=0)
-    normal = plane_normal(about[:, 0])
+    about = vectors - vectors[fleet].mean(axis=0)
+    normal = plane_normal(about[fleet, 0])
     return np.asarray((-2.0 * (about @ normal)[..., None] * normal).ravel(), np.float64)
 
 
@@ -134,27 +145,28 @@ def plane_normal(about: Matrix) -> Vector:
     return np.asarray(np.linalg.eigh(about.T @ about)[1][:, 0], np.float64)
 
 
-def mirrored(mean: Vector, covariance: Matrix) -> tuple[Vector, Matrix]:
-    """Mean ``(6n,)`` and covariance ``(6n, 6n)`` of a fleet that turned out to be the mirror image of an estimate.
+def mirrored(mean: Vector, covariance: Matrix, fleet: Mask) -> tuple[Vector, Matrix]:
+    """Mean ``(6n,)`` and covariance ``(6n, 6n)`` where the ``fleet`` ``(n,)`` is the mirror image of an estimate.
 
     On the wrong side the fleet was turned to fit its fixes as well as it could: the image may be, by `TURN_RAD`.
     """
-    there = mean + mirror_offset(mean)
-    reflection = _reflection(mean)
-    covariance = reflection @ covariance @ reflection
-    about = there.reshape(-1, 2, 3) - there.reshape(-1, 2, 3).mean(axis=0)
+    there = mean + mirror_offset(mean, fleet)
+    reflection = _reflection(mean, fleet)
+    covariance = reflection @ covariance @ reflection.T
+    vectors = there.reshape(-1, 2, 3)
+    about = vectors - vectors[fleet].mean(axis=0)
     for axis in np.eye(3):
         turn = TURN_RAD * np.cross(axis, about).ravel()
         covariance += np.outer(turn, turn)
     return there, symmetrised(covariance)
 
 
-def _reflection(state: Vector) -> Matrix:
-    """The linear map ``(6n, 6n)`` that mirrors deviations from the fleet's centre; its own inverse and transpose."""
+def _reflection(state: Vector, fleet: Mask) -> Matrix:
+    """The linear map ``(6n, 6n)`` that mirrors deviations from the fleet's centre; its own inverse."""
     positions = state.reshape(-1, 2, 3)[:, 0]
     n = len(positions)
-    normal = plane_normal(positions - positions.mean(axis=0))
-    centring = np.eye(n) - 1.0 / n
+    normal = plane_normal(positions[fleet] - positions[fleet].mean(axis=0))
+    centring = np.eye(n) - fleet / np.count_nonzero(fleet)
     across = np.kron(np.eye(2), np.outer(normal, normal))
     return np.asarray(np.eye(STATES_PER_AGENT * n) - 2.0 * np.kron(centring, across), np.float64)
 

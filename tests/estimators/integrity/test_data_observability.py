@@ -99,6 +99,7 @@ def unobserved(monitor: ObservabilityMonitor, fixed: set[int], *, slide: bool = 
             arrival_mean=state,
             arrival_information=1e6 * np.eye(6 * agents),
             slide=slide,
+            vehicles=np.ones(agents, np.bool_),
             period_s=DT,
             norm_smoothing=1e-3,
         )

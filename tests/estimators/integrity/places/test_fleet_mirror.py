@@ -13,9 +13,9 @@ from estimators.integrity.places.fleet_mirror import (
     FleetMirrorMonitor,
     MirrorImage,
     likelihood_ratio,
-    mirror_offset,
     mirrored,
 )
+from estimators.integrity.places.fleet_mirror import mirror_offset as offset_of_bodies
 from estimators.integrity.thresholds import CERTAIN_NATS, DECISIVE_NATS
 from estimators.integrity.window_evidence import WindowEvidence
 from estimators.model.layout import Layout
@@ -26,6 +26,15 @@ DT = 0.1
 SHARED = EstimatorSettings(kind="dmhe_shared", rounds=0, window=4, other_accel_variance=0.01)
 FIX_SIGMA_M = 2.0
 PLACES = np.array([[0, 0, 0], [12, 0, 1], [0, 12, -2], [-11, 3, 2.5], [2, -13, -1.5]], float)
+
+
+def everybody(state: np.ndarray) -> np.ndarray:
+    return np.ones(len(state) // 6, np.bool_)
+
+
+def mirror_offset(state: np.ndarray) -> np.ndarray:
+    """Of a fleet without targets."""
+    return offset_of_bodies(state, everybody(state))
 
 
 def at_rest(places: np.ndarray) -> np.ndarray:
@@ -49,8 +58,9 @@ def evidence(
     information: np.ndarray | None = None,
     *,
     slide: bool = True,
+    targets: int = 0,
 ) -> WindowEvidence:
-    """A window of one tick over an estimate that stands still.
+    """A window of one tick over an estimate that stands still, whose last ``targets`` bodies are no vehicles.
 
     ``information`` of the arrival cost; without, the estimate is far from a passage.
     """
@@ -63,6 +73,7 @@ def evidence(
         arrival_mean=state,
         arrival_information=1e6 * np.eye(6 * n) if information is None else information,
         slide=slide,
+        vehicles=np.arange(n) < n - targets,
         period_s=DT,
         norm_smoothing=1e-3,
     )
@@ -196,12 +207,65 @@ def test_three_drones_are_their_own_image() -> None:
         assert look(monitor, state, position_rows(1, 0, PLACES[1], np.ones(3)), np.zeros((18, 18))) == ()
 
 
+FAR_TARGET = np.array([-400.0, 30.0, 15.0])
+
+
+def with_target(information: np.ndarray, along: np.ndarray, weight: float) -> np.ndarray:
+    """A fleet's information, and that of a target of which ranges of one drone say a little along one direction."""
+    both = np.zeros((36, 36))
+    both[:30, :30] = information
+    slope = np.concatenate([np.zeros(24), along, np.zeros(3), -along, np.zeros(3)])
+    return both + weight * np.outer(slope, slope) + 1e-6 * np.eye(36)
+
+
+def test_a_target_far_behind_that_is_hardly_known_takes_nothing_from_what_the_fleet_is_sure_of() -> None:
+    # GIVEN a fleet that is well known on its side of its plane, and a target of which next to nothing is known
+    information = 1e3 * np.eye(30)
+    both = with_target(information, np.array([1.0, 0.0, 0.0]), 1.0)
+    state = at_rest(np.vstack([PLACES, FAR_TARGET]))
+    monitor = FleetMirrorMonitor()
+    # THEN nothing is doubted, and the fleet has the image that it has without the target
+    assert monitor.observe(evidence(state, empty_rows(), [0, 0, 0], both, targets=1)) == ()
+    fleet = np.arange(6) < 5
+    np.testing.assert_allclose(offset_of_bodies(state, fleet)[:30], mirror_offset(state[:30]), atol=1e-9)
+    # and the target's image is ranged to as the target is
+    np.testing.assert_allclose(distances(state + offset_of_bodies(state, fleet)), distances(state), atol=1e-9)
+
+
+def test_a_fleet_that_is_hardly_known_is_doubted_whatever_is_known_of_a_target() -> None:
+    # GIVEN a passage of the fleet, with a target that is ranged to precisely
+    state = at_rest(np.vstack([PLACES, FAR_TARGET]))
+    both = with_target(passage(state[:30]), np.array([0.0, 0.0, 1.0]), 1e6)
+    image = image_in(FleetMirrorMonitor().observe(evidence(state, empty_rows(), [0, 0, 0], both, targets=1)))
+    # THEN the range between the two, which both images fit, tells nothing of the side
+    assert image.probability == pytest.approx(1.0 / (1.0 + np.exp(2.0)), rel=1e-3)
+
+
+def test_three_drones_and_a_target_are_their_own_image() -> None:
+    state = at_rest(np.vstack([PLACES[:3], FAR_TARGET]))
+    assert FleetMirrorMonitor().observe(evidence(state, empty_rows(), [0, 0, 0], np.eye(24), targets=1)) == ()
+
+
+def test_a_fleet_and_its_target_are_mirrored_together() -> None:
+    # GIVEN an estimate in which the distance from a drone to the target is all that is well known
+    state, fleet = at_rest(np.vstack([PLACES, FAR_TARGET])), np.arange(6) < 5
+    along = (FAR_TARGET - PLACES[4]) / np.linalg.norm(FAR_TARGET - PLACES[4])
+    covariance = np.linalg.inv(with_target(1e-2 * np.eye(30), along, 1e4))
+    # WHEN it is mirrored
+    there, after = mirrored(state, covariance, fleet)
+    # THEN the distance is what it was and as well known
+    assert distances(there)[4, 5] == pytest.approx(distances(state)[4, 5])
+    turned = (there - state).reshape(6, 6)[5, :3] + FAR_TARGET - there.reshape(6, 6)[4, :3]
+    slope = np.concatenate([np.zeros(24), turned, np.zeros(3), -turned, np.zeros(3)]) / np.linalg.norm(turned)
+    assert slope @ after @ slope == pytest.approx(1e-4, rel=0.02)
+
+
 def test_a_mirrored_estimate_knows_its_ranges_as_well_and_its_direction_less() -> None:
     rng = np.random.default_rng(3)
     root = rng.normal(size=(30, 30))
     mean, information = at_rest(PLACES) + 0.1 * rng.normal(size=30), root @ root.T + np.eye(30)
     before = np.linalg.inv(information)
-    there, after = mirrored(mean, before)
+    there, after = mirrored(mean, before, everybody(mean))
     np.testing.assert_allclose(there, mean + mirror_offset(mean), atol=1e-12)
 
     def range_variance(state: np.ndarray, covariance: np.ndarray, a: int, b: int) -> float:

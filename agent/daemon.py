@@ -49,6 +49,7 @@ from agent.watch.diagnostics import (
     diagnostics_of,
     gauges_of,
     neighbour_gauges,
+    target_states,
 )
 from agent.watch.faults import ProgramFaults
 from agent.watch.log_lines import level_of
@@ -438,7 +439,9 @@ class Daemon:
         if self._record is not None:
             self._record.on_second(state)
         stated = str(self.core.integrity.statement or "")
-        message = diagnostics_of(self._agent_id, state.health, state.counters, state.gauges, state.neighbours, stated)
+        message = diagnostics_of(
+            self._agent_id, state.health, state.counters, state.gauges, state.neighbours, stated, state.targets
+        )
         self._left_out += len(state.neighbours) - len(message.neighbours)
         self._carry_out(self.onboard.tell(message, time.monotonic()))
 
@@ -457,4 +460,5 @@ class Daemon:
             counters |= self._record.counters()
         gauges = gauges_of(onboard, now_s) | self._ticks.gauges() | self._use.gauges()
         neighbours = neighbour_gauges(onboard, host_s, now_s)
-        return DaemonState(self._agent_id, now_s, self.core.health.health, counters, gauges, neighbours)
+        health, targets = self.core.health.health, target_states(onboard)
+        return DaemonState(self._agent_id, now_s, health, counters, gauges, neighbours, targets)

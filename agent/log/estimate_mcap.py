@@ -69,6 +69,8 @@ class Promise(msgspec.Struct, frozen=True, omit_defaults=True):
     guaranteed_half_axes_m: dict[str, list[float]] = {}
     """Of the sets that certainly hold those, where there are any."""
     least_range_m: dict[str, float] = {}
+    targets: dict[str, str] = {}
+    """What is known of each target (`estimators.integrity.protection.targets`)."""
 
 
 class EstimateMessage(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -150,6 +152,7 @@ def _promise(stated: Statement) -> Promise:
         {agent_key(each): level.vertical_m for each, level in stated.relative.items()},
         {agent_key(each): held.half_axes_m.tolist() for each, held in stated.guaranteed.items()},
         {agent_key(each): held.least_range_m for each, held in stated.guaranteed.items()},
+        {agent_key(each): str(state) for each, state in stated.targets.items()},
     )
 
 

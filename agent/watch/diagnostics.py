@@ -199,6 +199,12 @@ def relative_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
     return gauges
 
 
+def target_states(onboard: OnboardAgent) -> dict[str, str]:
+    """What is known of each target, by its id as text; nothing before the first estimate."""
+    stated = onboard.core.integrity.statement
+    return {} if stated is None else {str(each): str(state) for each, state in stated.targets.items()}
+
+
 def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
     """How well an agent's measurements fit the estimate (`estimators.integrity.innovations`): about 1 if as claimed.
 
@@ -241,11 +247,14 @@ def diagnostics_of(
     gauges: dict[str, float],
     neighbours: dict[str, dict[str, float]],
     integrity: str = "",
+    targets: dict[str, str] | None = None,
 ) -> Diagnostics:
     """The message that goes out; of very many neighbours the first ones, as many as fit into it."""
     reasons = tuple(reason[:MAX_REASON] for reason in health.reasons)
     said = integrity[:MAX_REASON]
-    message = Diagnostics(agent_id, str(health.state), reasons, counters, gauges, integrity=said)
+    message = Diagnostics(
+        agent_id, str(health.state), reasons, counters, gauges, integrity=said, targets=targets or {}
+    )
     return msgspec.structs.replace(message, neighbours=_fitting(neighbours, len(msgspec.json.encode(message))))
 
 

@@ -21,6 +21,7 @@ from estimators.integrity.exclusion.naming import NamingMonitor
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.protection.levels import error_ellipse, protection_level, relative_covariance
 from estimators.integrity.protection.statement import AlertLimits, Guaranteed, Statement, judged, undetectable
+from estimators.integrity.protection.targets import TargetState, target_state
 from estimators.integrity.sets.bank import BoundedTick, SensorBounds, SetBank
 from estimators.model.layout import position
 from estimators.model.measurements import Kind, RowTable, Vector
@@ -33,7 +34,8 @@ class IntegrityWatch:
 
     def __init__(self, config: FleetConfig, agent_id: int) -> None:
         table, period_s = config.integrity, config.fleet.period_s
-        self._agent_id = agent_id
+        self._agent_id, self._period_s = agent_id, period_s
+        self._targets = tuple(target.id for target in config.targets)
         self._exclude = table.exclude
         self._limits = AlertLimits(table.alert_horizontal_m, table.alert_vertical_m)
         self._naming = NamingMonitor(agent_id, period_s)
@@ -101,8 +103,17 @@ class IntegrityWatch:
             tuple(sorted(self._naming.ranges_off)),
             self._naming.unattributable_nats > 0.0,
             undetectable(self._naming.receivers),
+            {target: self._target(target, estimate, present) for target in self._targets},
         )
         return self.statement
+
+    def _target(self, target_id: int, estimate: Estimate, present: tuple[int, ...]) -> TargetState:
+        if target_id not in present:
+            return TargetState.NOT_FOUND
+        slot = present.index(target_id)
+        sigma_m = float(np.sqrt(estimate.covariance.diagonal()[position(slot)].max()))
+        unseen_s = float(estimate.age_ticks[slot]) * self._period_s
+        return target_state(sigma_m, unseen_s, observable=bool(estimate.observable[slot]))
 
     def _off(self, place_m: Vector) -> dict[int, float]:
         """Whose fixes are off, by how much; a frozen receiver by how far the drone has moved since."""

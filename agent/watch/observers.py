@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from agent.outputs import EstimateReady
 from agent.watch.health import Health
@@ -19,6 +19,8 @@ class DaemonState:
     gauges: dict[str, float]
     neighbours: dict[str, dict[str, float]]
     """Gauges of each neighbour's link, by its id as text."""
+    targets: dict[str, str] = field(default_factory=dict)
+    """What is known of each target (`estimators.integrity.protection.targets`), by its id as text."""
 
     def as_dict(self) -> dict[str, object]:
         """As it is written beside a record."""
@@ -29,6 +31,7 @@ class DaemonState:
             "counters": self.counters,
             "gauges": self.gauges,
             "neighbours": self.neighbours,
+            "targets": self.targets,
         }
 
 

@@ -31,6 +31,8 @@ DEGRADED_SIGMA_M = 5.0
 """Worse than what a receiver alone gives: the fleet does not help any more."""
 FAULT_SIGMA_M = 50.0
 """Not to be used for anything."""
+TARGET_UNSEEN_S = 5.0
+"""A target that nobody has measured for so long is where it was predicted to be."""
 
 # --- where ranges hold a drone ------------------------------------------------------------------------------
 

@@ -167,15 +167,17 @@ class FleetPicture:
     def _target(self, target: TargetTable, now_s: float) -> Target:
         seen = self._seen_by(target.id, now_s)
         estimate = None if seen is None else self._heard[seen.agent_id].estimate
-        if estimate is None:
+        if seen is None or estimate is None:
             return Target(target_id=target.id, name=target.name)
         place = position(Layout(estimate.agents).slot(target.id))
+        said = self._heard[seen.agent_id].diagnostics
         return Target(
             target_id=target.id,
             name=target.name,
             seen_by=seen,
             velocity_mps=_velocity(estimate, target.id),
             ellipse=ellipse_of(np.diag(estimate.variance[place])),
+            state="" if said is None else said.targets.get(str(target.id), ""),
         )
 
     def _drone(self, agent_id: int, now_s: float) -> Drone:

@@ -95,7 +95,7 @@ def _target(target: Target) -> str:
     north, east, down = seen.position_m
     return (
         f"{label}: N {north:.1f} E {east:.1f} up {-down:.1f} m, 3 sigma {ellipse.major_m:.2f}/{ellipse.up_m:.2f} m, "
-        f"age {seen.age_s:.1f} s, by drone {seen.agent_id}"
+        f"age {seen.age_s:.1f} s, by drone {seen.agent_id}{target.state and ': ' + target.state}"
     )
 
 

@@ -72,6 +72,8 @@ class Target(View, frozen=True):
     velocity_mps: Triple | None = None
     ellipse: Ellipse | None = None
     """Its axes are north and east: what drones tell of other bodies has no covariances between axes."""
+    state: str = ""
+    """What that drone states of it (docs/integrity.md)."""
 
 
 class Link(View, frozen=True):

@@ -14,7 +14,7 @@ from fleetloc.run.live_table import STALE_S
 from fleetloc.run.live_truth import LiveTruth
 from transport.messages.estimate_body import MAX_AGE_TICKS, FleetEstimate
 
-COLUMNS = ("target", "best known to drone", "error m", "sigma m")
+COLUMNS = ("target", "best known to drone", "state", "error m", "sigma m")
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +23,7 @@ class TargetRow:
 
     target: str
     seen_by: str
+    state: str = ""
     error: str = ""
     sigma: str = ""
 
@@ -46,7 +47,9 @@ def _row(config: FleetConfig, slot: int, observer: RunObserver, truth: LiveTruth
     north, east, down = (float(axis) for axis in estimate.mean[position(estimate.agents.index(target.id))])
     time_unix_s = config.fleet.epoch_unix_s + estimate.tick * config.fleet.period_s
     error_m = truth.error_m(len(config.ids) + slot, time_unix_s, (north, east, down))
-    return TargetRow(label, str(agent_id), "" if error_m is None else f"{error_m:.2f}", f"{sigma_m:.2f}")
+    said = observer.agents[agent_id].diagnostics
+    state = "" if said is None else said.targets.get(str(target.id), "")
+    return TargetRow(label, str(agent_id), state, "" if error_m is None else f"{error_m:.2f}", f"{sigma_m:.2f}")
 
 
 def _has(observed: Observed, target_id: int, now_s: float) -> bool:
@@ -68,14 +71,14 @@ def table(picture: list[TargetRow]) -> Table:
     for column in COLUMNS:
         shown.add_column(column, justify="right")
     for row in picture:
-        shown.add_row(row.target, row.seen_by, row.error, row.sigma)
+        shown.add_row(row.target, row.seen_by, row.state, row.error, row.sigma)
     return shown
 
 
 def lines(picture: list[TargetRow]) -> list[str]:
     """The picture for a log."""
     return [
-        f"  target {row.target}: best known to drone {row.seen_by}; "
+        f"  target {row.target}: best known to drone {row.seen_by}{row.state and ': ' + row.state}; "
         f"error {row.error or '?'} m, sigma {row.sigma or '?'} m"
         for row in picture
     ]

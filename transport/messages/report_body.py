@@ -27,6 +27,8 @@ class Diagnostics(msgspec.Struct, frozen=True, omit_defaults=True):
     neighbours: Annotated[dict[Name, dict[Name, float]], msgspec.Meta(max_length=256)] = {}
     integrity: Text = ""
     """State and reason of what is promised of the own position (docs/integrity.md)."""
+    targets: Annotated[dict[Name, Name], msgspec.Meta(max_length=256)] = {}
+    """What it knows of each target, by id."""
 
 
 _DIAGNOSTICS = msgspec.json.Decoder(Diagnostics)

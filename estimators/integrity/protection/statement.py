@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.protection.levels import ErrorEllipse, ProtectionLevel
+from estimators.integrity.protection.targets import TargetState
 from estimators.integrity.thresholds import FEWEST_RECEIVERS
 from estimators.model.measurements import Vector
 
@@ -69,6 +70,8 @@ class Statement:
     """Whether somebody's fixes are off now, and it cannot be told whose."""
     undetectable: tuple[str, ...]
     """What could be wrong and would not be seen, always."""
+    targets: Mapping[int, TargetState] = field(default_factory=dict)
+    """Of every target of the configuration, by id: said of it alone, and nothing of the own position."""
 
     def __str__(self) -> str:
         return f"{self.state}: {self.reason}" if self.reason else str(self.state)

@@ -129,6 +129,7 @@ function showTargets() {
     cell(row, speed ? number(Math.hypot(speed[0], speed[1]), 1) : "–");
     cell(row, target.seen_by ? number(target.seen_by.age_s, 1) : "–");
     cell(row, target.seen_by ? target.seen_by.agent_id : "nobody");
+    cell(row, target.state || "–", !target.state || target.state === "known" ? "" : "warning");
     return row;
   });
   byId("targets").tBodies[0].replaceChildren(...rows);

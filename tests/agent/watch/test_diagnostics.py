@@ -12,7 +12,7 @@ from agent.watch.health import assess
 from agent.watch.position_watch import PositionWatch, TickEvidence
 from estimators.integrity.solution import Solution
 from estimators.integrity.staleness import Ages
-from transport.messages.report_body import Diagnostics
+from transport.messages.report_body import Diagnostics, decode_diagnostics, encode_diagnostics
 from transport.security.auth import UNSIGNED
 from transport.security.sealing import Sealer
 
@@ -45,6 +45,12 @@ def test_the_message_of_a_drone_with_very_many_neighbours_can_be_sent(
     assert min(count, told) <= len(message.neighbours) <= told + 10
     assert message.counters == counters
     assert message.reasons[-1].endswith("... and 291 more")
+
+
+def test_what_is_known_of_targets_is_told() -> None:
+    message = diagnostics_of(1, replace(SILENT, reasons=()), {}, {}, {}, "NOMINAL", {"101": "not observable"})
+    assert message == Diagnostics(1, "init", integrity="NOMINAL", targets={"101": "not observable"})
+    assert decode_diagnostics(encode_diagnostics(message)) == message
 
 
 def test_a_reason_that_is_too_long_is_cut() -> None:

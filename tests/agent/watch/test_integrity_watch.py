@@ -12,6 +12,7 @@ from agent.watch.integrity_watch import IntegrityWatch, bounds_of
 from estimators.estimator import Estimate, Status
 from estimators.integrity.finding import What, has
 from estimators.integrity.protection.statement import ALIKE, IntegrityState
+from estimators.integrity.protection.targets import TargetState
 from estimators.model.measurements import Kind
 from tests.support.sitl_fleet import fleet_config
 from tests.support.uncalibrated_fleet import jump, rows_of_flight
@@ -33,6 +34,17 @@ def estimate(tick: int, sigma_m: float = 0.3) -> Estimate:
     mean = np.zeros(30)
     mean[::6] = 10.0 * np.arange(5)
     return Estimate(tick, mean, sigma_m**2 * np.eye(30), Status.OK, np.zeros(5, np.int64))
+
+
+def test_what_is_said_of_targets_is_said_of_them_alone() -> None:
+    # GIVEN a drone that knows where it is, one target that the data do not tell, and one that nobody has found
+    made = IntegrityWatch(fleet_config(targets=[{"id": 101}, {"id": 102}]), 1)
+    observable, mean = np.array([True, True, True, False]), np.arange(24.0)
+    known = Estimate(7, mean, 0.01 * np.eye(24), Status.OK, np.zeros(4, np.int64), observable=observable)
+    # THEN each is stated for itself, and the own position is as good as it is
+    stated = made.state(known, (1, 2, 3, 101), ())
+    assert stated.targets == {101: TargetState.NOT_OBSERVABLE, 102: TargetState.NOT_FOUND}
+    assert str(stated) == "NOMINAL"
 
 
 @pytest.mark.parametrize("exclude", [True, False])

@@ -25,6 +25,7 @@ from fleetloc.run.live_truth import LiveTruth, TruePlaces
 from fleetloc.run.lockstep_run import fly_in_lockstep
 from sim_bridge.world.truth import load_truth
 from transport.messages.estimate_body import FleetEstimate
+from transport.messages.report_body import Diagnostics
 
 ROVER = 101
 START_M, VELOCITY_MPS = (-10.0, -10.0, 0.0), (1.0, 0.8, 0.0)
@@ -120,7 +121,9 @@ def test_the_live_table_has_it_with_its_error(flown: Flown) -> None:
         observer.agents[agent_id].estimate = last_estimate(flown, agent_id)
         observer.agents[agent_id].estimate_s = now_s
     # THEN one row says who knows it best, and how far off that is
+    observer.agents[1].diagnostics = observer.agents[2].diagnostics = Diagnostics(1, "ok", targets={"101": "poor"})
     (row,) = live_targets.target_rows(flown.config, observer, truth, now_s)
+    assert row.state == "poor"
     assert row.target == "101 rover"
     assert row.seen_by in ("1", "2")
     assert 0.0 < float(row.error) < 5.0
@@ -140,6 +143,7 @@ def test_the_monitor_shows_it_with_its_ellipse_and_without_anybody_says_so(flown
     assert target.seen_by is None
     estimate = last_estimate(flown, 2)
     picture.on_estimate(2, estimate, 100.0)
+    picture.on_diagnostics(Diagnostics(2, "ok", targets={"101": "not observable"}), 100.0)
     shown = picture.at(100.1, 1e9)
     (target,) = shown.targets
     assert target.name == "rover"
@@ -150,4 +154,6 @@ def test_the_monitor_shows_it_with_its_ellipse_and_without_anybody_says_so(flown
     sigma_m = np.sqrt(estimate.variance[24:27])
     assert target.ellipse.major_m == pytest.approx(3 * max(sigma_m[:2]))
     assert target.ellipse.up_m == pytest.approx(3 * sigma_m[2])
-    assert any("target 101 rover" in line and "by drone 2" in line for line in monitor_table.lines(shown))
+    assert target.state == "not observable"
+    (line,) = [line for line in monitor_table.lines(shown) if "target 101 rover" in line]
+    assert line.endswith("by drone 2: not observable")

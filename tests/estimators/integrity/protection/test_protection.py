@@ -21,6 +21,8 @@ from estimators.integrity.protection.statement import (
     judged,
     undetectable,
 )
+from estimators.integrity.protection.targets import TargetState, target_state
+from estimators.integrity.thresholds import DEGRADED_SIGMA_M, TARGET_UNSEEN_S
 
 LIMITS = AlertLimits(4.0, 6.0)
 SMALL = ProtectionLevel(1.0, 1.5)
@@ -84,3 +86,18 @@ def test_the_state_and_what_it_follows_from(
 def test_what_cannot_be_seen_is_always_said() -> None:
     assert undetectable(5) == (ALIKE,)
     assert undetectable(3) == (ALIKE, ONE_OF_FEW)
+
+
+@pytest.mark.parametrize(
+    ("sigma_m", "unseen_s", "observable", "state"),
+    [
+        (0.9 * DEGRADED_SIGMA_M, 0.0, True, TargetState.KNOWN),
+        (0.9 * DEGRADED_SIGMA_M, 1.1 * TARGET_UNSEEN_S, True, TargetState.UNSEEN),
+        (1.1 * DEGRADED_SIGMA_M, 1.1 * TARGET_UNSEEN_S, True, TargetState.POOR),
+        (0.1, 0.0, False, TargetState.NOT_OBSERVABLE),
+    ],
+)
+def test_what_is_stated_of_a_target_is_the_worst_that_is_known_of_it(
+    sigma_m: float, unseen_s: float, observable: bool, state: TargetState
+) -> None:
+    assert target_state(sigma_m, unseen_s, observable=observable) is state

@@ -41,8 +41,9 @@ TARGET_SIGMA_M = 15.0
 """A target less well known is not one of the state yet."""
 WIDENED = 9.0
 """On the covariance of a target's place by ranges that the window holds as well."""
-STANDING_MPS = 0.02
-"""1-sigma per axis of the velocity of a target that is said to be fixed."""
+STANDING_MPS = 3e-4
+"""1-sigma per axis of the velocity of a target that is said to be fixed: once nobody sees it any more, it is moved on
+by 2 cm a minute at most."""
 TARGET_BIAS_M = 0.5
 """1-sigma of the bias of ranges to it, which all share."""
 

@@ -86,7 +86,7 @@ class SharedMovingHorizonEstimator:
         self._own: Pair = self._states.pair()
         self._last: SlowSolution | None = None
         """Of the tick before, to start from."""
-        self._consensus = Inheritance(slot)
+        self._consensus = Inheritance(layout, slot)
         self._innovations = InnovationMonitor(layout.size, slot, period_s)
         self._rival: Rival | None = None
         """The same fleet with a drone at another place, while that is possible."""
@@ -187,8 +187,9 @@ class SharedMovingHorizonEstimator:
     def _range_biases(self, solution: SlowSolution) -> RangeBiases | None:
         if self._sizes is None:
             return None
-        variance = solution.covariance.diagonal()[self.belief.states :]
-        return RangeBiases.of(self.layout.size, solution.slow, variance, self._sizes.sizes())
+        states = self.belief.states
+        covariance = solution.covariance[states:, states:]
+        return RangeBiases.of(self.layout, solution.slow, covariance, self._sizes.sizes())
 
     def _compared(
         self, problem: SlowProblem, solution: SlowSolution, budget: int | None

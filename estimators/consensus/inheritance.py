@@ -27,7 +27,7 @@ from estimators.compiled.linear_algebra import cholesky_solve, cholesky_upper, f
 from estimators.consensus.information import fits
 from estimators.estimator import Payload
 from estimators.model.gaussian import Pair, symmetrised
-from estimators.model.layout import STATES_PER_AGENT
+from estimators.model.layout import STATES_PER_AGENT, BodyKind, Layout
 from estimators.model.measurements import Matrix, Vector
 from estimators.model.members import MemberChange
 
@@ -40,7 +40,8 @@ than one pair in ten million. Both hold mostly the same measurements, so that th
 than that of their difference."""
 FLOOR = 0.01
 """Least standard deviation, in m along any direction and in m/s, that a pair may claim: an antenna's phase centre is
-not known to a centimetre in flight, and such a velocity would say where it is a second later."""
+not known to a centimetre in flight, and such a velocity would say where it is a second later. Of a body that is said
+to stand still everybody knows that."""
 KNOWN_M = 0.5
 """An agent whose own position is known so well, along every direction, holds what says so itself."""
 OVERCLAIMED_NATS = 8.0
@@ -49,14 +50,14 @@ times along every axis. A neighbour has the same measurements and perhaps a few 
 
 
 class Inheritance:
-    """One agent's rounds of it; ``slot`` is the own place, which nobody knows better."""
+    """One agent's rounds of it, over a layout's bodies; ``slot`` is the own place, which nobody knows better."""
 
-    def __init__(self, slot: int) -> None:
+    def __init__(self, layout: Layout, slot: int) -> None:
         self.refused = 0
         """Neighbours' pairs of the right tick that could not be fused, or did not fit the own one."""
         self.disbelieved: tuple[int, ...] = ()
         """Slots of those whose pairs did not fit the own one in the latest round."""
-        self._slot = slot
+        self._slot, self._stands = slot, _stands(layout)
         self._tick = 0
         self._pair: Pair = (np.zeros((0, 0)), np.zeros(0))
 
@@ -74,7 +75,7 @@ class Inheritance:
         Pairs of another tick are not used. With ``fuse`` false the own pair stays what it is.
         """
         timely = {slot: pair for slot, pair in received.items() if pair.tick == self._tick}
-        usable, better, self.disbelieved = survey(self._pair, timely, self._slot)
+        usable, better, self.disbelieved = survey(self._pair, timely, self._slot, self._stands)
         self.refused += len(timely) - len(usable)
         heard: list[int] = []
         if not better or not fuse:
@@ -92,17 +93,26 @@ class Inheritance:
 
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet."""
-        self._slot = change.own
+        self._slot, self._stands = change.own, _stands(change.after)
+
+
+def _stands(layout: Layout) -> NDArray[np.bool_]:
+    """``(n,)`` which bodies are said to stand still."""
+    return np.array([kind is BodyKind.ANCHOR for kind in layout.kinds])
 
 
 def survey(
-    own: Pair, pairs: Mapping[int, Payload], slot: int, threshold: float = WORTHWHILE_NATS
+    own: Pair,
+    pairs: Mapping[int, Payload],
+    slot: int,
+    stands: NDArray[np.bool_],
+    threshold: float = WORTHWHILE_NATS,
 ) -> tuple[dict[int, Payload], bool, tuple[int, ...]]:
     """Of neighbours' pairs, by slot: those to be fused, whether one of them knows an agent better, and who is wrong.
 
     The best informed first, whatever its place: what is made of them does not depend on the agents' order. ``own`` is
-    the own pair, of the same tick; ``slot`` the own place, which nobody knows better. Wrong are sound pairs that do
-    not fit the own one, or claim more than can be known.
+    the own pair, of the same tick; ``slot`` the own place, which nobody knows better; ``stands`` ``(n,)`` which
+    bodies are said to stand still. Wrong are sound pairs that do not fit the own one, or claim what nobody can know.
     """
     n = len(own[1])
     fitting = [each for each, pair in pairs.items() if fits(pair, n)]
@@ -111,7 +121,7 @@ def survey(
         informations[place], vectors[place] = pairs[each].information, pairs[each].vector
     log_dets, believed = np.empty(len(fitting)), np.empty(len(fitting), np.bool_)
     information, vector = np.ascontiguousarray(own[0]), np.ascontiguousarray(own[1])
-    better = _compare(information, vector, informations, vectors, slot, threshold, log_dets, believed)
+    better = _compare(information, vector, informations, vectors, slot, stands, threshold, log_dets, believed)
     known = {
         each: known
         for each, known, fit in zip(fitting, log_dets.tolist(), believed, strict=True)
@@ -122,8 +132,8 @@ def survey(
 
 
 @entry(
-    "boolean(float64[:, ::1], float64[::1], float64[:, :, ::1], float64[:, ::1], int64, float64, float64[::1],"
-    " boolean[::1])"
+    "boolean(float64[:, ::1], float64[::1], float64[:, :, ::1], float64[:, ::1], int64, boolean[::1], float64,"
+    " float64[::1], boolean[::1])"
 )
 def _compare(
     own: Matrix,
@@ -131,6 +141,7 @@ def _compare(
     informations: NDArray[np.float64],
     vectors: Matrix,
     slot: int,
+    stands: NDArray[np.bool_],
     threshold: float,
     log_dets: Vector,
     believed: NDArray[np.bool_],
@@ -162,7 +173,7 @@ def _compare(
         inverse_from_cholesky(root, covariance)
         if sound:
             away = np.dot(covariance, vectors[p]) - own_mean
-            believed[p] = _credible(covariance, slot, own_covariance)
+            believed[p] = _credible(covariance, slot, stands, own_covariance)
             for k in range(agents):
                 believed[p] = believed[p] and _agrees(own_covariance, covariance, away, k)
         for k in range(agents):
@@ -186,10 +197,12 @@ def _agrees(own: Matrix, other: Matrix, away: Vector, slot: int) -> bool:
 
 
 @kernel
-def _credible(covariance: Matrix, slot: int, own: Matrix) -> bool:
+def _credible(covariance: Matrix, slot: int, stands: NDArray[np.bool_], own: Matrix) -> bool:
     """Whether a pair's covariance claims what can be known: of anybody, and of the place of ``slot``, the own one."""
     room = np.empty((3, 3))
     for first in range(0, covariance.shape[0], 3):
+        if first % STATES_PER_AGENT > 0 and stands[first // STATES_PER_AGENT]:
+            continue
         for i in range(3):
             for j in range(3):
                 room[i, j] = covariance[first + i, first + j]

@@ -33,8 +33,10 @@ ACCEL_MPS2 = 0.15, 0.02, 1.0
 """The same of the error of an acceleration."""
 LOST_S = 1.0
 """Without fixes for longer, an autopilot's attitude is taken for that of an estimator without aiding."""
-TARGET_PAIR_M = 0.5
-"""Of the bias of ranges to a body that is no vehicle: of another sensor, of which the fleet's tell nothing."""
+TARGET_SENSOR_M = 0.5
+"""Of the bias of all ranges to a body that is no vehicle: of another sensor, of which the fleet's tell nothing."""
+TARGET_PAIR_M = 0.1
+"""Of what the bias of the ranges of one drone to it differs from that."""
 DRIFT_M, SCALE = 10.0, 0.04
 """Of a barometer: 10 m cover where it is put at first, and are, with its time constant, 0.4 m in a minute and 3 m in
 an hour; 4 % of the height are 12 K."""
@@ -50,7 +52,7 @@ class SystematicSizes:
         self._share = period_s / MEMORY_S
         self._wanders = ReceiverWanders(agents, period_s)
         self._pair_m = PAIR_M[0]
-        self._of_target = _pairs_with_others(layout)
+        self._is_vehicle, self._of_target = layout.is_vehicle, _pairs_with_others(layout)
         self._accel_mps2: Vector = np.full(agents, ACCEL_MPS2[0])
         self._lost_ticks = np.zeros(agents, np.int64)
         """Since the last fix that left the window."""
@@ -87,7 +89,8 @@ class SystematicSizes:
         tilted = np.where(self._lost_ticks > self._most_ticks, TILTED_MPS2, 0.0)
         _fill(self._wanders.sizes_m(), self._accel_mps2, tilted, self._pair_m, out)
         out[slow_errors.pairs(agents)][self._of_target] = TARGET_PAIR_M
-        out[slow_errors.drifts(agents)], out[slow_errors.scales(agents)] = DRIFT_M, SCALE
+        out[slow_errors.drifts(agents)] = np.where(self._is_vehicle, DRIFT_M, TARGET_SENSOR_M)
+        out[slow_errors.scales(agents)] = SCALE
         return out
 
     def white_factors(self) -> Matrix:
@@ -97,7 +100,7 @@ class SystematicSizes:
     def change_members(self, change: MemberChange) -> None:
         """Go on with another fleet."""
         self._made, known = None, change.stayed
-        self._of_target = _pairs_with_others(change.after)
+        self._is_vehicle, self._of_target = change.after.is_vehicle, _pairs_with_others(change.after)
         self._wanders.change_members(known, change.after.size)
         self._accel_mps2 = np.array(
             [self._accel_mps2[known[slot]] if slot in known else ACCEL_MPS2[0] for slot in range(change.after.size)]

@@ -7,12 +7,14 @@ Each is a Gauss-Markov process that enters the rows:
 
     fix of agent a along u:        + u . w_a + u . w
     range between a and b:         + b_ab
+    range between a and target t:  + b_at + s_t
     acceleration of a:             + e_a
     barometer of a, at height z:   + d_a + z k_a
 
-Their sizes follow the data, but for those of barometers (`estimators.systematic.sizes`). Order of the q errors:
-wander ``3n``, acceleration ``3n``, common wander ``3``, pairs ``n (n - 1) / 2``, drift of barometers ``n``, their
-scale ``n``. A row with a hard bound has none: its sensor is said to have no others.
+Ranges to a target are made by a sensor of its own, which is off by as much for all drones, s_t. Sizes follow the
+data, but for those of barometers and targets (`estimators.systematic.sizes`). Order of the q errors: wander ``3n``,
+acceleration ``3n``, common wander ``3``, pairs ``n (n - 1) / 2``, drift of barometers ``n``, where that of a target
+is s_t, their scale ``n``. A row with a hard bound has none: its sensor is said to have no others.
 """
 
 from __future__ import annotations
@@ -20,6 +22,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
@@ -69,7 +72,7 @@ def pair_of(one: int, other: int, agents: int) -> int:
 
 
 def drifts(agents: int) -> slice:
-    """Drifts of the barometers, NED m."""
+    """Drifts of the barometers, NED m; of a target, which has none, the bias of ranges to it."""
     return slice(count(agents) - 2 * agents, count(agents) - agents)
 
 
@@ -107,15 +110,17 @@ def places_before(before: int, stayed: Mapping[int, int], after: int) -> IntArra
     return was
 
 
-def couplings(rows: RowTable, agents: int) -> tuple[IntArray, Matrix]:
-    """Which slow errors each row holds ``(m, 7)``, -1 where fewer, and by how much."""
+def couplings(rows: RowTable, is_vehicle: NDArray[np.bool_]) -> tuple[IntArray, Matrix]:
+    """Which slow errors each row holds ``(m, 7)``, -1 where fewer, and by how much; ``is_vehicle`` ``(n,)``."""
     at, by = np.full((len(rows), COUPLED), -1, np.int64), np.zeros((len(rows), COUPLED))
-    _couple(rows, agents, at, by)
+    _couple(rows, is_vehicle, at, by)
     return at, by
 
 
-@entry("void(ROW[::1], int64, int64[:, ::1], float64[:, ::1])", ROW=ROW)
-def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
+@entry("void(ROW[::1], boolean[::1], int64[:, ::1], float64[:, ::1])", ROW=ROW)
+def _couple(rows: RowTable, is_vehicle: NDArray[np.bool_], at: IntArray, by: Matrix) -> None:
+    agents = is_vehicle.shape[0]
+    drifts_at = 6 * agents + 3 + agents * (agents - 1) // 2
     for r in range(rows.shape[0]):
         row, j = rows[r], 0
         if np.isfinite(row["half_width"]):
@@ -128,12 +133,14 @@ def _couple(rows: RowTable, agents: int, at: IntArray, by: Matrix) -> None:
                     at[r, j + 1], by[r, j + 1] = 6 * agents + i, direction[i]
                     j += 2
         elif row["kind"] == HEIGHT and row["x"] != 0.0:
-            drift = 6 * agents + 3 + agents * (agents - 1) // 2 + row["agent"]
+            drift = drifts_at + row["agent"]
             at[r, 0], by[r, 0] = drift, row["x"]
             at[r, 1], by[r, 1] = drift + agents, row["x"] * row["value"]
         elif row["kind"] == RANGE:
             a, b = min(row["agent"], row["other"]), max(row["agent"], row["other"])
             at[r, 0], by[r, 0] = 6 * agents + 3 + a * agents - a * (a + 1) // 2 + b - a - 1, 1.0
+            if not (is_vehicle[a] and is_vehicle[b]):
+                at[r, 1], by[r, 1] = drifts_at + (a if is_vehicle[b] else b), 1.0
 
 
 def corrected_rows(rows: RowTable, at: IntArray, by: Matrix, errors: Vector, variance: Vector) -> RowTable:

@@ -101,7 +101,7 @@ def slow_problem(
     if ignored is not None and ignored.any():
         data[ignored.rows(rows), PRECISION] *= IGNORED_FACTOR
     if len(belief.sizes):
-        at, by = slow_errors.couplings(rows, agents)
+        at, by = slow_errors.couplings(rows, window.layout.is_vehicle)
         measured = np.repeat(window.layout.is_vehicle, 3)  # a body that tells no acceleration has no error of it
         push_at = np.where(measured, np.arange(3 * agents, 6 * agents), -1)
         push_by = measured.astype(float)

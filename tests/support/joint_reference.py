@@ -22,8 +22,8 @@ LIMIT_SQUARES = {1: 9.0, 2: 11.8, 3: 14.2}
 """Squares beyond which one, two and three rows that have one weight are outliers."""
 
 
-def coupling_matrix(rows: RowTable, agents: int) -> Array:
-    """How each row ``(m, q)`` holds the slow errors."""
+def coupling_matrix(rows: RowTable, agents: int, targets: tuple[int, ...] = ()) -> Array:
+    """How each row ``(m, q)`` holds the slow errors; ``targets``: slots of the bodies that are no vehicles."""
     out = np.zeros((len(rows), slow_errors.count(agents)))
     for r, row in enumerate(rows):
         if np.isfinite(row["half_width"]):
@@ -37,6 +37,8 @@ def coupling_matrix(rows: RowTable, agents: int) -> Array:
             out[r, slow_errors.scales(agents).start + int(row["agent"])] = row["x"] * row["value"]
         elif row["kind"] == Kind.RANGE:
             out[r, slow_errors.pair_of(int(row["agent"]), int(row["other"]), agents)] = 1.0
+            for slot in {int(row["agent"]), int(row["other"])}.intersection(targets):
+                out[r, slow_errors.drifts(agents).start + slot] = 1.0
     return out
 
 

@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from estimators.consensus.inheritance import inherit, survey
+from estimators.consensus.inheritance import Inheritance, inherit, survey
 from estimators.estimator import Payload
-from estimators.model.layout import block
+from estimators.model.layout import BodyKind, Layout, block
 
+NOBODY_STANDS = np.zeros(3, np.bool_)
 AGENTS = 3
 
 
@@ -106,15 +107,15 @@ def test_a_survey_tells_which_pairs_can_be_fused_and_whether_one_knows_better() 
     received = {1: tell(third, mean), 2: tell(mine, mean)}
     received |= {3: Payload(7, -third[0], third[1], rank=0), 4: Payload(7, third[0], np.full(18, np.nan), rank=0)}
     # WHEN they are surveyed
-    usable, better, wrong = survey(own, received, slot=0)
+    usable, better, wrong = survey(own, received, 0, NOBODY_STANDS)
     # THEN the best informed of those that are sound comes first
     log_dets = {slot: np.linalg.slogdet(received[slot].information)[1] for slot in (1, 2)}
     assert list(usable) == sorted(log_dets, key=lambda slot: -log_dets[slot])
     assert better
     assert wrong == ()
     # and what is known of the own place does not count
-    assert survey(own, {2: received[2]}, slot=0) == ({2: received[2]}, False, ())
-    assert survey(own, {}, slot=0) == ({}, False, ())
+    assert survey(own, {2: received[2]}, 0, NOBODY_STANDS) == ({2: received[2]}, False, ())
+    assert survey(own, {}, 0, NOBODY_STANDS) == ({}, False, ())
 
 
 @pytest.mark.parametrize("agent", range(AGENTS))
@@ -126,7 +127,7 @@ def test_a_pair_that_has_an_agent_elsewhere_is_not_inherited(agent: int, away_si
     mean = np.zeros(18)
     mean[6 * agent] = away_sigmas * np.sqrt(1.0 / own[0][6 * agent, 6 * agent] + 1.0 / other[0][6 * agent, 6 * agent])
     # WHEN it is looked at THEN it is believed within what both admit, whoever it is about
-    usable, better, wrong = survey(own, {2: tell(other, mean)}, slot=0)
+    usable, better, wrong = survey(own, {2: tell(other, mean)}, 0, NOBODY_STANDS)
     assert bool(usable) == better == believed
     assert wrong == (() if believed else (2,))
 
@@ -146,7 +147,31 @@ def test_a_pair_that_claims_what_nobody_can_know_is_not_inherited(
 ) -> None:
     own = np.diag(np.repeat([0.2, 0.2, 3.0], 6) ** -2.0), np.zeros(18)
     other = np.diag(np.repeat(sigmas, 6) ** -2.0), np.zeros(18)
-    assert survey(own, {1: Payload(7, *other, rank=0)}, slot=0)[2] == (() if believed else (1,))
+    assert survey(own, {1: Payload(7, *other, rank=0)}, 0, NOBODY_STANDS)[2] == (() if believed else (1,))
+
+
+@pytest.mark.parametrize(
+    ("position_m", "velocity_mps", "kind", "believed"),
+    [
+        (0.1, 1e-4, BodyKind.ANCHOR, True),  # that it stands still everybody knows
+        (0.1, 1e-4, BodyKind.TARGET, False),
+        (0.1, 1e-4, BodyKind.VEHICLE, False),
+        (0.008, 1e-4, BodyKind.ANCHOR, False),
+    ],
+)
+def test_of_a_body_that_stands_still_the_velocity_may_be_known_to_any_degree(
+    position_m: float, velocity_mps: float, kind: BodyKind, believed: bool
+) -> None:
+    # GIVEN a neighbour that knows the second drone better, and a third body so well
+    layout = Layout((1, 2, 9), (BodyKind.VEHICLE, BodyKind.VEHICLE, kind))
+    both = np.repeat([position_m, velocity_mps], 3)
+    own = np.diag(np.concatenate([np.full(6, 0.2), np.full(6, 3.0), both]) ** -2.0), np.zeros(18)
+    other = np.diag(np.concatenate([np.full(6, 0.2), np.full(6, 0.2), both]) ** -2.0), np.zeros(18)
+    consensus = Inheritance(layout, 0)
+    consensus.begin(7, own)
+    # WHEN its pair comes THEN it is inherited from, unless it claims what nobody can know
+    assert list(consensus.mix({1: Payload(7, *other, rank=0)})) == ([1] if believed else [])
+    assert consensus.disbelieved == (() if believed else (1,))
 
 
 def test_who_does_not_know_its_own_place_may_learn_it() -> None:
@@ -154,4 +179,4 @@ def test_who_does_not_know_its_own_place_may_learn_it() -> None:
     own = np.diag(np.repeat([1.0, 3.0, 3.0], 6) ** -2.0), np.zeros(18)
     other = np.diag(np.repeat([0.1, 0.2, 0.2], 6) ** -2.0), np.zeros(18)
     # THEN a neighbour that knows it ten times as well is believed
-    assert survey(own, {1: Payload(7, *other, rank=0)}, slot=0)[2] == ()
+    assert survey(own, {1: Payload(7, *other, rank=0)}, 0, NOBODY_STANDS)[2] == ()

@@ -12,7 +12,7 @@ from estimators.model.measurements import RowTable, empty_inputs, input_rows, po
 from estimators.model.unknown_motion import TARGET_ACCEL_VARIANCE
 from estimators.settings import EstimatorSettings, LimitsTable, TargetLimits, VehicleLimits
 from estimators.systematic import slow_errors
-from estimators.systematic.sizes import TARGET_PAIR_M, SystematicSizes
+from estimators.systematic.sizes import DRIFT_M, TARGET_PAIR_M, TARGET_SENSOR_M, SystematicSizes
 from estimators.window.assembly import open_window
 from estimators.window.history import ANCHOR_ACCEL_VARIANCE
 
@@ -53,7 +53,9 @@ def test_ranges_to_a_target_have_a_bias_of_their_own_size() -> None:
     agents = LAYOUT.size
     assert sizes[slow_errors.pair_of(0, 2, agents)] == TARGET_PAIR_M
     assert sizes[slow_errors.pair_of(2, 3, agents)] == TARGET_PAIR_M
-    assert sizes[slow_errors.pair_of(0, 1, agents)] < TARGET_PAIR_M
+    assert sizes[slow_errors.pair_of(0, 1, agents)] > TARGET_PAIR_M
+    # and most of it is of the target's sensor
+    assert sizes[slow_errors.drifts(agents)].tolist() == [DRIFT_M, DRIFT_M, TARGET_SENSOR_M, TARGET_SENSOR_M]
 
 
 PLACES = np.array([[0.0, 0, -40], [30, 0, -50], [0, 30, -45], [30, 30, -60], [15, 5, 0]])
@@ -103,3 +105,43 @@ def test_a_target_that_joins_is_found_by_ranges_and_leaves_without_a_trace(kind:
     estimator.change_members((1, 2, 3, 4), 1, {})
     assert estimator.layout == Layout((1, 2, 3, 4))
     assert fly(60, 61, target=False)[block(0)] == pytest.approx(before, abs=0.2)
+
+
+def test_the_bias_of_a_targets_sensor_is_told_once_drones_have_been_around_it() -> None:
+    # GIVEN four drones that circle a beacon at different heights, and ranges to it that are all 0.3 m too long
+    rng, bias_m, beacon = np.random.default_rng(8), 0.3, np.array([5.0, 3.0, 0.0])
+    period_s, lap_s = 0.5, 40.0
+
+    def state(slot: int, tick: int) -> np.ndarray:
+        phase, turn = 2.0 * np.pi * (tick * period_s / lap_s + slot / 4.0), 2.0 * np.pi / lap_s
+        place = np.array([30.0 * np.cos(phase), 30.0 * np.sin(phase), -15.0 - 15.0 * slot])
+        return np.concatenate([place, 30.0 * turn * np.array([-np.sin(phase), np.cos(phase), 0.0])])
+
+    settings = EstimatorSettings(kind="dmhe_shared", window=5, rounds=0, systematic_errors=True)
+    mean = np.concatenate([state(slot, 0) for slot in range(4)])
+    estimator = make_estimator(settings, Layout((1, 2, 3, 4)), 0, mean, np.eye(24), period_s)
+    last = None
+    for tick in range(100):
+        if tick == 10:
+            prior = np.array([*(beacon + 1.0), 0.0, 0.0, 0.0]), np.diag([9.0] * 3 + [1e-7] * 3)
+            estimator.change_members((1, 2, 3, 4, 9), 1, {9: prior}, {9: BodyKind.ANCHOR})
+        at = [state(slot, tick) for slot in range(4)]
+        tables = [position_rows(tick, s, at[s][:3] + 0.1 * rng.normal(size=3), [0.01] * 3) for s in range(4)]
+        for slot in range(4 if tick >= 10 else 0):
+            away = float(np.linalg.norm(at[slot][:3] - beacon)) + bias_m + 0.2 * rng.normal()
+            tables.append(range_row(tick, slot, 4, away, 0.04))
+        push = []
+        for slot in range(4 if tick else 0):
+            pushed = (at[slot][3:] - state(slot, tick - 1)[3:]) / period_s
+            push.append(input_rows(tick - 1, slot, pushed, 0.01))
+        estimator.begin(tick, np.concatenate(tables), np.concatenate(push) if tick else empty_inputs())
+        last = estimator.solve()
+    # THEN what is common to them is taken for the sensor's, as sure as that is, and the beacon is where it is
+    assert last is not None
+    assert last.range_biases is not None
+    told, sigma = last.range_biases.target_m, last.range_biases.target_sigma_m
+    assert abs(told[4] - bias_m) < min(0.1, 3.0 * sigma[4])
+    assert np.isnan(told[:4]).all()
+    assert last.range_biases.bias_m[0, 4] == pytest.approx(bias_m, abs=0.15)
+    assert last.range_biases.sigma_m[0, 4] < 0.2
+    assert np.linalg.norm(last.mean[position(4)] - beacon) < 0.3

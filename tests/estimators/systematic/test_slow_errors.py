@@ -28,8 +28,8 @@ def drawn_rows(seed: int, agents: int) -> RowTable:
     return builders.joined([*tables, position_rows(0, agents - 1, np.zeros(3), np.ones(3)), bounded])
 
 
-def dense_couplings(rows: RowTable, agents: int) -> np.ndarray:
-    at, by = slow_errors.couplings(rows, agents)
+def dense_couplings(rows: RowTable, agents: int, targets: tuple[int, ...] = ()) -> np.ndarray:
+    at, by = slow_errors.couplings(rows, ~np.isin(np.arange(agents), targets))
     out = np.zeros((len(rows), slow_errors.count(agents)))
     for r in range(len(rows)):
         held = at[r] >= 0
@@ -60,6 +60,18 @@ def test_every_error_has_one_place(agents: int) -> None:
 def test_rows_hold_what_their_sensor_has(seed: int, agents: int) -> None:
     rows = drawn_rows(seed, agents)
     np.testing.assert_array_equal(dense_couplings(rows, agents), coupling_matrix(rows, agents))
+
+
+@given(seed=st.integers(0, 999), agents=st.integers(2, 5), data=st.data())
+def test_ranges_to_a_target_hold_what_its_sensor_has(seed: int, agents: int, data: st.DataObject) -> None:
+    target = data.draw(st.integers(0, agents - 1))
+    rows = drawn_rows(seed, agents)
+    rows = rows[(rows["kind"] != Kind.HEIGHT) | (rows["agent"] != target)]  # it has no barometer
+    held = dense_couplings(rows, agents, (target,))
+    np.testing.assert_array_equal(held, coupling_matrix(rows, agents, (target,)))
+    to_it = (rows["kind"] == Kind.RANGE) & ((rows["agent"] == target) | (rows["other"] == target))
+    free = to_it & ~np.isfinite(rows["half_width"])
+    np.testing.assert_array_equal(held[:, slow_errors.drifts(agents)][:, target], free.astype(float))
 
 
 @given(seed=st.integers(0, 999), order=AGENTS.flatmap(lambda agents: st.permutations(range(agents))))
@@ -121,7 +133,7 @@ def test_corrected_rows_are_less_their_errors_and_less_sure() -> None:
     rng = np.random.default_rng(3)
     rows = drawn_rows(5, 3)
     errors, variance = rng.normal(size=slow_errors.count(3)), rng.uniform(0.1, 1.0, slow_errors.count(3))
-    at, by = slow_errors.couplings(rows, 3)
+    at, by = slow_errors.couplings(rows, np.ones(3, np.bool_))
     corrected = slow_errors.corrected_rows(rows, at, by, errors, variance)
     held = coupling_matrix(rows, 3)
     np.testing.assert_allclose(corrected["value"], rows["value"] - held @ errors, rtol=0, atol=1e-12)

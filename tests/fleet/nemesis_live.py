@@ -43,7 +43,7 @@ END_WITHIN_S = 3.0
 MOST_SIGMAS = 5.0
 """An error beyond it, once the fleet is well again, was not claimed."""
 KNOWN_WITHIN_TICKS = 8
-START_S = 90.0
+START_S = 240.0
 """A fleet on a busy machine takes so long to be there."""
 STRUCK = ("kill", "stop", "both_stop", "full_disk", "one_way")
 
@@ -105,6 +105,8 @@ class LiveFlight:
         self.seed, self.out = seed, folder / f"run{seed}"
         self.blows = live_schedule(seed, (1, 2, 3))
         self.broken: list[str] = []
+        self.last_blow_s = max([CALM_S, *(each.to_s for each in self.blows)])
+        """Later, where a daemon that was started anew takes its time: it is back when it has its autopilot."""
         self._restarted: list[subprocess.Popen[bytes]] = []
         self._fleet = FleetProcess(
             self.out, *with_overrides(overrides_of(seed, link, self.blows)), "--duration", "600"
@@ -119,7 +121,10 @@ class LiveFlight:
             for at_s, act in sorted(self._acts(), key=lambda each: each[0]):
                 self._wait_for(at_s)
                 act()
-            self._wait_for(max([CALM_S, *(each.to_s for each in self.blows)]) + HEALED_S + JUDGED_S)
+            if self._restarted:
+                _until(self._all_back, START_S, "daemons that were started anew")
+                self.last_blow_s = max(self.last_blow_s, time.monotonic() - self._began_s)
+            self._wait_for(self.last_blow_s + HEALED_S + JUDGED_S)
             self._end()
         finally:
             self._fleet.clean_up()
@@ -159,14 +164,22 @@ class LiveFlight:
 
     def _restart(self, agent_id: int) -> None:
         file = str(self.out / run_files.CONFIG)
-        self._restarted.append(
-            subprocess.Popen(
-                [sys.executable, "-m", "fleetloc", "agent", file, "--id", str(agent_id)],
-                cwd=ROOT,
-                stderr=subprocess.DEVNULL,
-                start_new_session=True,
+        with self._log_of_restart(len(self._restarted)).open("wb") as log:
+            self._restarted.append(
+                subprocess.Popen(
+                    [sys.executable, "-m", "fleetloc", "agent", file, "--id", str(agent_id), "-v"],
+                    cwd=ROOT,
+                    stderr=log,
+                    start_new_session=True,
+                )
             )
-        )
+
+    def _log_of_restart(self, number: int) -> Path:
+        return self.out / f"restarted_{number}.log"
+
+    def _all_back(self) -> bool:
+        logs = [self._log_of_restart(number).read_text() for number in range(len(self._restarted))]
+        return all("autopilot connected" in log for log in logs)
 
     def _fill_disk(self, agent_id: int) -> None:
         """From now on no file of the daemon grows, as on a disk that is full."""
@@ -201,7 +214,7 @@ class LiveFlight:
         deprived = any(each.kind == "full_disk" and each.agent == agent_id for each in self.blows)
         if deprived:
             return []  # it flies on without a record
-        healed_s = max([CALM_S, *(each.to_s for each in self.blows)]) + HEALED_S
+        healed_s = self.last_blow_s + HEALED_S
         start_s = float(truth.time_unix_s[0]) - config.fleet.epoch_unix_s
         entries = parts[-1] if parts else np.empty(0)
         last = entries[entries["t_s"] >= start_s + healed_s] if len(entries) else entries

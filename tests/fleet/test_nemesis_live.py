@@ -57,6 +57,7 @@ class Flown(LiveFlight):
 
     def __init__(self, folder: Path, blow: Blow) -> None:
         self.seed, self.out, self.blows, self.broken = 1, folder, (blow,), []
+        self.last_blow_s = blow.to_s
 
 
 def leave(

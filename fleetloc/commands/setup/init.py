@@ -22,13 +22,14 @@ def init(
         str, typer.Option(metavar="LAT,LON,ALT", help="A point in the middle of your field: deg, deg, m above sea.")
     ],
     drones: Annotated[int, typer.Option(help="How many drones there are.", min=1, max=999)] = 3,
-    name: Annotated[str, typer.Option(help="The fleet's name.")] = "myfleet",
+    name: Annotated[str, typer.Option(metavar="NAME", help="The fleet's name.")] = "myfleet",
     autopilot: Annotated[Autopilot, typer.Option(help="px4, ardupilot, or auto: as its heartbeat says.")] = "auto",
     link: Annotated[
         str,
         typer.Option(
+            metavar="ADDRESS",
             help="Address of each autopilot; {id} is the drone's id, {port} is 14550 more. "
-            "On a drone e.g. serial:/dev/autopilot{id}:921600."
+            "On a drone e.g. serial:/dev/autopilot{id}:921600.",
         ),
     ] = "udpin:127.0.0.1:{port}",
     uwb: Annotated[
@@ -39,15 +40,15 @@ def init(
     ] = "wired",
     address: Annotated[
         str | None,
-        typer.Option(help="Address of each drone on the radio, e.g. 192.168.7.{id}; without: all on this computer."),
+        typer.Option(metavar="HOST", help="Each drone's on the radio, e.g. 192.168.7.{id}; without: all are here."),
     ] = None,
     feedback: Annotated[
         bool, typer.Option("--feedback", help="Give the autopilots the estimate when GPS is lost.")
     ] = False,
 ) -> None:
-    """Write a first configuration of a fleet, which `fleetloc check` passes.
+    """Write a first configuration of a fleet.
 
-    What it writes is a beginning: open it in an editor. An existing file is never changed.
+    `fleetloc check` passes it, and it is a beginning: open it in an editor. An existing file is never changed.
     """
     import time
     import tomllib

@@ -116,7 +116,9 @@ class LiveFlight:
     def fly(self) -> None:
         """From start to end; whatever happens, no process of it is left."""
         try:
-            _until(self._fleet.flying, START_S, "the flight")
+            process = self._fleet.process
+            _until(lambda: self._fleet.flying() or process.poll() is not None, START_S, "the flight")
+            assert process.poll() is None, process.communicate()[1].strip().splitlines()[-1:]
             self._began_s = time.monotonic()
             for at_s, act in sorted(self._acts(), key=lambda each: each[0]):
                 self._wait_for(at_s)

@@ -77,6 +77,6 @@ def test_a_target_has_a_path_like_a_drone_but_cannot_leap_between_waypoints() ->
 
 def test_the_fleets_of_situational_awareness_fly_what_they_say() -> None:
     configs = {path.stem: load_config(path) for path in (CONFIGS / "awareness").glob("*.toml")}
-    assert set(configs) == {"sparse_graph", "link_failures", "fixed_target", "moving_target"}
+    assert set(configs) == {"sparse_graph", "link_failures", "fixed_target", "moving_target", "survey"}
     for config in configs.values():
         assert {path.agent for path in sim_table(config).paths} == set(config.bodies)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from estimators.settings import EstimatorSettings, with_kind_defaults
 from fleetloc.output import print_table, progress_bar
-from sim_bridge.studies.awareness import DRONES, AwarenessScenario, Graph, measure
+from sim_bridge.studies.awareness import DRONES, TARGET_BIAS_M, AwarenessScenario, Graph, measure
 from sim_bridge.studies.awareness_flight import AwarenessFlight, fly_awareness
 from sim_bridge.studies.monte_carlo import Hangar
 
@@ -121,6 +121,7 @@ def of_target(flight: AwarenessFlight) -> dict[str, float]:
         "error_of_target_50s_to_100s_m": float(error_m[50:100].mean()),
         "error_of_target_from_100s_m": float(error_m[100:].mean()),
         "anees_of_target": _mean(nees[SETTLED_S:]),
+        "bias_of_target_off_by_m": _mean(np.abs(flight.bias_m[SETTLED_S:, 0] - TARGET_BIAS_M)),
         "share_beyond_5_sigma": float((nees[np.isfinite(nees)] * 3.0 > 25.0).mean())
         if np.isfinite(nees).any()
         else 0.0,

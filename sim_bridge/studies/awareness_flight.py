@@ -57,12 +57,13 @@ class AwarenessFlight:
 
     ``error_m`` ``(T+1, n, B)`` of the position, infinite where a body was no part of the estimate; ``nees``
     ``(T+1, n, B)`` of the position over its dimension; ``ok`` ``(T+1, n)``: a tick had an estimate in time, with the
-    status OK.
+    status OK. ``bias_m`` ``(T+1, n)``: by how much the target's sensor is off; NaN where nothing is known.
     """
 
     error_m: Floats
     nees: Floats
     ok: NDArray[np.bool_]
+    bias_m: Floats
 
 
 def config_of(measured: AwarenessInput, settings: EstimatorSettings) -> FleetConfig:
@@ -117,6 +118,7 @@ class _Flight:
         shape = *measured.ranges.shape[:2], measured.truth.shape[1]
         self._error_m, self._nees = np.full(shape, np.inf), np.full(shape, np.nan)
         self._ok = np.zeros(shape[:2], np.bool_)
+        self._bias_m = np.full(shape[:2], np.nan)
 
     def _channel(self, receiver: int, neighbours: tuple[int, ...], loss: float, seed: int) -> Channel[Parcel]:
         # a packet of tick k goes out when the tick has ended
@@ -137,7 +139,7 @@ class _Flight:
             t_s = self._start_s + tick * PERIOD_S
             self._queue.at(t_s + WIRE_S, functools.partial(self._sense, tick, t_s))
         self._queue.run_until(self._start_s + (ticks + 1 + LINGER_TICKS) * PERIOD_S)
-        return AwarenessFlight(self._error_m, self._nees, self._ok)
+        return AwarenessFlight(self._error_m, self._nees, self._ok, self._bias_m)
 
     def _sense(self, tick: int, t_s: float) -> None:
         now_s = self._queue.now_s
@@ -178,7 +180,9 @@ class _Flight:
         tick, slot = estimate.tick - FIRST_TICK, agent.agent_id - 1
         if not 0 <= tick <= self._measured.scenario.ticks or not agent.core.fleet.started:
             return
-        present = agent.core.fleet.present
+        present, biases = agent.core.fleet.present, agent.core.fleet.range_biases
+        if biases is not None and TARGET_ID in present:
+            self._bias_m[tick, slot] = biases.target_m[present.index(TARGET_ID)]
         self._ok[tick, slot] = ready.on_time and estimate.status is Status.OK
         for body, at in enumerate(agent.core.layout.agents):
             if at in present:

@@ -16,7 +16,9 @@ from sim_bridge.studies.awareness_flight import AwarenessFlight
 
 
 def flight(error_m: np.ndarray, nees: np.ndarray) -> AwarenessFlight:
-    return AwarenessFlight(error_m, nees, np.ones(error_m.shape[:2], bool))
+    bias_m = np.full(error_m.shape[:2], np.nan)
+    bias_m[40:, 0], bias_m[:40, 0], bias_m[:, 1] = 0.42, 5.0, 9.0  # drone 1 after 50 s is looked at
+    return AwarenessFlight(error_m, nees, np.ones(error_m.shape[:2], bool), bias_m)
 
 
 def test_a_target_is_found_when_it_is_near_and_lost_where_it_is_no_part_of_the_estimate() -> None:
@@ -28,6 +30,7 @@ def test_a_target_is_found_when_it_is_near_and_lost_where_it_is_no_part_of_the_e
     assert found["found_after_s"] == 20.0
     assert found["error_of_target_50s_to_100s_m"] == 1.0
     assert found["share_beyond_5_sigma"] == pytest.approx(50 / 133)
+    assert found["bias_of_target_off_by_m"] == pytest.approx(0.12)
     error_m[60, 0, DRONES] = np.inf
     assert of_target(flight(error_m, nees))["error_of_target_50s_to_100s_m"] == np.inf
 

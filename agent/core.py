@@ -38,6 +38,7 @@ from agent.fleet.measurements import (
     height_measurement,
     odometry_measurement,
     range_measurement,
+    sighting_measurement,
 )
 from agent.fleet.neighbourhood import rounds_of
 from agent.fleet.neighbours import NeighbourTable
@@ -47,6 +48,7 @@ from agent.fleet.tracking import FleetTracker, in_layout
 from agent.outputs import CoreOutput, EstimateReady, Faulted, HealthChanged, Tell, estimate_message
 from agent.sensing.barometer import Barometer
 from agent.sensing.climb import without_climb
+from agent.sensing.detections import DetectionSample, ned_direction
 from agent.sensing.gps_antenna import at_body
 from agent.sensing.ground import altitude_of, distance_of
 from agent.sensing.latency import GpsLatency
@@ -291,6 +293,20 @@ class AgentCore:
         else:
             arm = own_arm(self._own, sample.tag, self.timeline.orientation_at(sample.t_s))
             self._count_own("range", anchor_measurement(sample, anchor_m, arm, self._period_s, self._config.sensors))
+
+    def on_detection(self, sample: DetectionSample, now_s: float) -> None:
+        """Where this agent's camera saw a target; of one seen without a distance the estimate has to have one."""
+        if not self._plausible("detection", sample.t_s, now_s):
+            return
+        direction = ned_direction(sample, self.timeline.orientation_at(sample.t_s))
+        away_m = self.fleet.roll.distance_m(self._agent_id, sample.target)
+        if direction is None:
+            self.counters["detection: attitude unknown"] += 1
+        elif sample.distance_m is None and away_m is None:
+            self.counters["detection: bearing of a target not found"] += 1
+        else:
+            record = sighting_measurement(self._agent_id, sample, direction, away_m or 0.0, self._period_s)
+            self._count_own("detection", record)
 
     def on_packet(self, received: Received, now_s: float) -> None:
         """A neighbour's message, opened and checked by the transport."""

@@ -39,6 +39,7 @@ from agent.outputs import (
     ToAutopilot,
 )
 from agent.sensing.clock import FleetClock, clock_fault, step_fault
+from agent.sensing.detections import DetectionAdapter
 from agent.sensing.frames import gravity_mps2
 from agent.sensing.samples import Sample
 from agent.sensing.timeline import Timeline
@@ -51,6 +52,7 @@ from estimators.model.layout import block
 from transport.errors import EncodeError, Rejected
 from transport.messages.agreement_body import Agreement, agreement_hash
 from transport.messages.clock_body import ClockAnswer, decode_clock_question
+from transport.messages.detection_body import is_detection_frame
 from transport.messages.uwb_body import UwbFrame
 from transport.security.auth import Identity
 from transport.security.opening import Opener
@@ -109,6 +111,7 @@ class OnboardAgent:
         self.autopilot = AutopilotSession(config, agent_id, self.clock, datagrams=datagrams, signing=link_signing)
         antennas = {agent.id: len(agent.uwb_tags_m) for agent in config.agents if agent.uwb_tags_m}
         antennas |= dict.fromkeys(config.places_m, 1)
+        self.detections = DetectionAdapter(agent_id, config.kinds)
         self.uwb = UwbAdapter(agent_id, (*config.bodies, *config.places_m), config.sensors, antennas)
         shared = shared_settings(config)
         self.opener = Opener(
@@ -192,9 +195,13 @@ class OnboardAgent:
         self.core.on_sample(sample, self.fleet_s(host_s))
 
     def on_uwb(self, data: bytes, host_s: float) -> None:
-        """A frame of the own UWB module that arrived at ``host_s``."""
+        """A frame of the own UWB module, or camera, that arrived at ``host_s``."""
         self._note(UwbIn(host_s, data), host_s)
         now_s = self.fleet_s(host_s)
+        if is_detection_frame(data):
+            for seen in self.detections.receive(data, now_s=now_s, host_s=host_s, unix_s=self.unix_s(host_s)):
+                self.core.on_detection(seen, now_s)
+            return
         for sample in self.uwb.receive(data, now_s=now_s, host_s=host_s, unix_s=self.unix_s(host_s)):
             self.core.on_range(sample, now_s)
 

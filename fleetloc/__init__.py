@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from sim_bridge.replay.flight_log_replay import FlightLogReplay
     from sim_bridge.world.truth import Truth, TruthError
     from transport.errors import EncodeError, KeyFileError, SessionError
+    from transport.messages.detection_body import Detection
     from transport.messages.estimate_body import FleetEstimate
     from transport.messages.report_body import Diagnostics
     from transport.messages.uwb_body import UwbFrame, UwbRange, encode_uwb_json
@@ -28,6 +29,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "ConfigError",
+    "Detection",
     "Diagnostics",
     "EncodeError",
     "EstimateLog",
@@ -66,6 +68,7 @@ _PLACES = {
     "sim_bridge.replay.flight_log_replay": ("FlightLogReplay",),
     "sim_bridge.world.truth": ("Truth", "TruthError"),
     "transport.errors": ("EncodeError", "KeyFileError", "SessionError"),
+    "transport.messages.detection_body": ("Detection",),
     "transport.messages.estimate_body": ("FleetEstimate",),
     "transport.messages.report_body": ("Diagnostics",),
     "transport.messages.uwb_body": ("UwbFrame", "UwbRange", "encode_uwb_json"),

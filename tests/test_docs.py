@@ -370,7 +370,8 @@ def test_the_budget_of_the_wire_is_that_of_the_codecs() -> None:
     told = re.findall(
         r"position (\d+), velocity (\d+), speed (\d+), range (\d+), anchor range (\d+), acceleration (\d+), and with "
         r"\S+ \S+ orientation (\d+), range between antennas (\d+), speed of an antenna (\d+); "
-        r"\S+ (\d+), height above ground (\d+), velocity of another sensor than the receiver (\d+)",
+        r"\S+ (\d+), height above ground (\d+); with a camera sighting (\d+); "
+        r"velocity of another sensor than the receiver (\d+)",
         page,
     )
     assert [int(size) for size in told[0]] == [sizes[kind] for kind in MeasurementKind]

@@ -29,6 +29,7 @@ from transport.messages.measurement_body import (
     Measurement,
     OrientationMeasurement,
     RangeMeasurement,
+    SightingMeasurement,
 )
 
 MAX_RANGES = 48
@@ -95,7 +96,43 @@ class RangeLocator:
         The window holds the ranges after ``at_tick`` too. So the prior is so wide that they hardly count twice: it
         says where to begin, and the window says the rest.
         """
+        seen = self._seen(target_id, at_tick, until_tick)
+        if seen is not None:
+            self.findings[target_id] = ()
+            return seen
         return self._taken(target_id, self._fit(target_id, at_tick, until_tick), self._target_monitor, WIDENED)
+
+    def _seen(self, target_id: int, at_tick: int, until_tick: int) -> Prior | None:
+        """The prior of a target seen with its distance in one of the last ticks, from the latest of these."""
+        sightings = [
+            (record, place)
+            for record in self._ranges
+            if isinstance(record, SightingMeasurement) and record.other == target_id and not record.is_bearing
+            and until_tick - RANGE_MEMORY_TICKS <= record.tick < until_tick
+            and (place := self._known.get(record.tick, {}).get(record.observer)) is not None
+        ]  # fmt: skip
+        latest = max((record.tick for record, _ in sightings), default=None)
+        information, vector = np.zeros((3, 3)), np.zeros(3)
+        for record, (mean, covariance) in sightings:
+            if record.tick != latest:
+                continue
+            sight = np.array(record.direction)
+            along = np.outer(sight, sight)
+            noise = record.variance_m2 * along + record.variance_across_m2 * (np.eye(3) - along)
+            weight = np.linalg.inv(covariance + noise + TARGET_BIAS_M**2 * np.eye(3))
+            information += weight
+            vector += weight @ (mean[:3] + record.offset_s * mean[3:] + record.range_m * sight)
+        if latest is None:
+            return None
+        standing = self._kinds.get(target_id) is BodyKind.ANCHOR
+        speed_mps = STANDING_MPS if standing else VELOCITY_SIGMA_MPS
+        found = np.linalg.inv(information)
+        if np.linalg.eigvalsh(found)[-1] > TARGET_SIGMA_M**2:
+            return None
+        spread, passed_s = np.zeros((6, 6)), abs(latest - at_tick) * self._period_s
+        spread[:3, :3], spread[3:, 3:] = WIDENED * found, speed_mps**2 * np.eye(3)
+        spread[:3, :3] += (passed_s * speed_mps) ** 2 * np.eye(3)
+        return np.concatenate((found @ vector, np.zeros(3))), spread
 
     def _taken(
         self, agent_id: int, found: Place | None, monitor: RangeLocationMonitor, inflation: float
@@ -112,6 +149,7 @@ class RangeLocator:
             (record, other, place)
             for record in self._ranges
             if record.tick < until_tick
+            and not isinstance(record, SightingMeasurement)
             and (other := _other_end(record, agent_id)) is not None
             and (place := self._place_of(record, other)) is not None
         ]

@@ -20,6 +20,7 @@ from transport.messages.measurement_body import (
     Measurements,
     OrientationMeasurement,
     RangeMeasurement,
+    SightingMeasurement,
     as_sent,
     fitting,
 )
@@ -194,7 +195,9 @@ class MeasurementStore:
 
     def _is_turned(self, record: Measurement, tick: int) -> bool:
         """Whether it is known how the ends of a range lay, or it has waited for that long enough."""
-        if not isinstance(record, RangeMeasurement) or self.arms.knows(record):
+        if not isinstance(record, RangeMeasurement) or isinstance(record, SightingMeasurement):
+            return True
+        if self.arms.knows(record):
             return True
         waited = tick - record.tick >= min(ATTITUDE_TICKS, self._hold_ticks)
         self.unturned += waited
@@ -228,7 +231,8 @@ class MeasurementStore:
     def _count_ranges(self, let_go: Iterable[Measurement]) -> None:
         """Count the own ranges among what is let go unused."""
         for record in let_go:
-            self.unused_ranges += isinstance(record, RangeMeasurement) and record.observer == self._agent_id
+            ranged = isinstance(record, RangeMeasurement) and not isinstance(record, SightingMeasurement)
+            self.unused_ranges += ranged and record.observer == self._agent_id
 
     def packet(self, tick: int, exchange: int, neighbours: frozenset[int]) -> Measurements:
         """What ``neighbours`` get in an exchange: what one of them may lack, newest first, then echoes.

@@ -18,12 +18,14 @@ import numpy as np
 from agent.config.tables import SensorsTable
 from agent.fleet.lever_arms import LeverArms, Shift
 from agent.sensing.barometer import SIGMA_M
+from agent.sensing.detections import DetectionSample
 from agent.sensing.odometry import MeasuredVelocity
 from agent.sensing.samples import BaroSample, GpsSample, RangeSample, Triple
 from agent.sensing.timeline import TickInput, nearest_tick
-from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable
+from estimators.model.measurements import INPUT, ROW, InputTable, Kind, RowTable, relative_rows
 from transport.messages.measurement_body import (
     NO_BOUND,
+    UNSEEN_VARIANCE,
     AccelerationMeasurement,
     AnchorRangeMeasurement,
     AntennaSpeedMeasurement,
@@ -34,6 +36,7 @@ from transport.messages.measurement_body import (
     OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
+    SightingMeasurement,
     SpeedMeasurement,
     TagRangeMeasurement,
     VelocityMeasurement,
@@ -115,6 +118,21 @@ def anchor_measurement(
     return AnchorRangeMeasurement(said.observer, said.tick, seen, said.range_m, *noise, said.offset_s)
 
 
+def sighting_measurement(
+    observer: int, sample: DetectionSample, direction: Triple, away_m: float, period_s: float
+) -> SightingMeasurement:
+    """The record of a detection, along a ``direction`` in NED; ``away_m`` where it has no distance of its own."""
+    tick = nearest_tick(sample.t_s, period_s)
+    distance_m, sigma_m = sample.distance_m, sample.distance_sigma_m
+    seen_m = away_m if distance_m is None else distance_m
+    along = UNSEEN_VARIANCE if sigma_m is None else sigma_m**2
+    across = (sample.sigma_rad * seen_m) ** 2
+    offset_s = sample.t_s - tick * period_s
+    return SightingMeasurement(
+        observer, tick, sample.target, seen_m, along, math.inf, offset_s, direction, across
+    )
+
+
 def height_measurement(observer: int, sample: BaroSample, period_s: float) -> HeightMeasurement:
     """The record of a barometer's sample, whose altitude is above the fleet's origin."""
     tick = nearest_tick(sample.t_s, period_s)
@@ -147,12 +165,14 @@ def acceleration_measurement(observer: int, closed: TickInput) -> AccelerationMe
 def rows_of(
     records: Iterable[Measurement], slots: Mapping[int, int], arms: LeverArms | None = None
 ) -> RowTable:
-    """The rows of records of sensors, in their order; ``slots`` by agent id, ``arms`` where antennas have any.
+    """The rows of records of sensors, in their order, sightings last.
 
-    None is surer than `LEAST_SIGMA`. All in one table at once: numpy takes as long for a table of one row as for ten.
-    Raises `TypeError` for an acceleration, which is an input, and for an orientation, which turns arms.
+    ``slots`` by agent id, ``arms`` where antennas have any. None is surer than `LEAST_SIGMA`. All in one table at
+    once: numpy takes as long for a table of one row as for ten. Raises `TypeError` for an acceleration, which is an
+    input, and for an orientation, which turns arms.
     """
     rows: list[_Row] = []
+    tables: list[RowTable] = []
     for record in records:
         tick, slot = record.tick, slots[record.observer]
         match record:
@@ -169,6 +189,8 @@ def rows_of(
                 noise = record.variance_m2ps2, record.half_width_mps
                 shift = record.shift_mps if isinstance(record, AntennaSpeedMeasurement) else _NOWHERE
                 rows.append((tick, record.offset_s, record.speed_mps, *noise, *shift, Kind.SPEED, slot, -1, slot))
+            case SightingMeasurement():
+                tables.append(_sighting_rows(record, slot, slots[record.other]))
             case RangeMeasurement():
                 between = Shift() if arms is None else arms.shift(record)
                 noise, other = (record.variance_m2 + between.variance_m2, record.half_width_m), slots[record.other]
@@ -184,8 +206,16 @@ def rows_of(
             case AccelerationMeasurement() | OrientationMeasurement():
                 raise TypeError(f"not a measurement that makes rows: {record}")
     table = np.array(rows, ROW)
+    if tables:
+        table = np.concatenate((table, *tables))
     np.maximum(table["variance"], LEAST_SIGMA**2, out=table["variance"])
     return table
+
+
+def _sighting_rows(record: SightingMeasurement, slot: int, other: int) -> RowTable:
+    place = record.range_m * np.array(record.direction)
+    along = None if record.is_bearing else record.variance_m2
+    return relative_rows(record.tick, slot, other, place, along, record.variance_across_m2, offset_s=record.offset_s)
 
 
 def inputs_of(records: Iterable[AccelerationMeasurement], slots: Mapping[int, int]) -> InputTable:

@@ -236,6 +236,12 @@ class Membership:
         places = np.array([place for place, _ in near]).reshape(-1, 3)
         return RangeGeometry.of(self._places[agent], places, np.array([age for _, age in near]))
 
+    def distance_m(self, one: int, other: int) -> float | None:
+        """Between two members in the latest estimate; ``None`` where one is none, or both are at one place."""
+        if not {one, other} <= set(self.members) or not {one, other} <= self._places.keys():
+            return None
+        return float(np.linalg.norm(self._places[one] - self._places[other])) or None
+
     def may_be_member(self, agent: int) -> bool:
         """Whether an agent is wanted in the estimate."""
         return self.wanted is None or agent in self.wanted or agent in self._targets

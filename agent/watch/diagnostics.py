@@ -110,9 +110,11 @@ def counters_of(onboard: OnboardAgent) -> dict[str, int]:
         ("", _samples(onboard)),
         ("skipped ", dict(core.timeline.skipped)),
         ("skipped uwb ", dict(uwb.skipped)),
+        ("skipped detection ", dict(onboard.detections.skipped)),
         ("gps latency ", dict(core.gps_latency.counters)),
         ("refused ", dict(core.records.refused)),
         ("rejected uwb ", uwb.intake.rejections.as_dict()),
+        ("rejected detection ", onboard.detections.intake.rejections.as_dict()),
         ("rejected ", opener.peers.rejections()),
     )
     for prefix, table in tables:
@@ -223,6 +225,7 @@ def nis_gauges(onboard: OnboardAgent, agent_id: int) -> dict[str, float]:
         "nis_gps_speed": squares[Kind.SPEED],
         "nis_heights": squares[Kind.HEIGHT],
         "nis_odometry": squares[Kind.ODOMETRY],
+        "nis_sightings": squares[Kind.RELATIVE],
         "nis_ranges": squares[Kind.RANGE] if slot == own else innovations.pairs[own, slot],
         "weight_gps_position": innovations.weights[slot, Kind.POSITION],
     }

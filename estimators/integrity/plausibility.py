@@ -18,7 +18,7 @@ from estimators.integrity.thresholds import FAR_M, FAR_MPS, FAR_SIGMAS, REFUSED_
 from estimators.model.layout import STATES_PER_AGENT
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 
-_PLACED = (Kind.POSITION, Kind.RANGE, Kind.ANCHOR_RANGE)
+_PLACED = (Kind.POSITION, Kind.RANGE, Kind.ANCHOR_RANGE, Kind.RELATIVE)
 """What is measured in m."""
 
 
@@ -102,7 +102,7 @@ class PlausibilityMonitor:
         sigma = evidence.sigma.reshape(-1, STATES_PER_AGENT)
         spread_m, spread_mps = sigma[:, :3].max(axis=1), sigma[:, 3:].max(axis=1)
         lead_s = (rows["tick"] - evidence.belief_tick) * self._period_s + rows["offset_s"]
-        one, other = rows["agent"], np.where(rows["kind"] == Kind.RANGE, rows["other"], rows["agent"])
+        one, other = rows["agent"], np.where(rows["other"] >= 0, rows["other"], rows["agent"])
         velocity = states[one, 3:]
         place, there = (states[each, :3] + lead_s[:, None] * states[each, 3:] for each in (one, other))
         axis = np.stack([rows["x"], rows["y"], rows["z"]], axis=1)
@@ -112,6 +112,7 @@ class PlausibilityMonitor:
             Kind.ODOMETRY: lambda: _along(axis, velocity),
             Kind.SPEED: lambda: _length(velocity + axis),
             Kind.RANGE: lambda: _length(place - there + axis),
+            Kind.RELATIVE: lambda: _along(axis, place - there),
             Kind.ANCHOR_RANGE: lambda: _length(place - axis),
         }
         off = np.zeros(len(rows))
@@ -126,12 +127,12 @@ class PlausibilityMonitor:
 
 
 def _with_their_fixes(rows: RowTable, refused: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Rows that are refused, and with an axis of a fix or velocity its others."""
+    """Rows that are refused, and with an axis of a fix, velocity or sighting its others."""
     if not refused.any():
         return refused
-    whole = [rows[name].astype(np.float64) for name in ("observer", "kind", "tick", "offset_s")]
+    whole = [rows[name].astype(np.float64) for name in ("observer", "kind", "other", "tick", "offset_s")]
     _, fix = np.unique(np.stack(whole, axis=1), axis=0, return_inverse=True)
-    vectors = np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY))
+    vectors = np.isin(rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY, Kind.RELATIVE))
     return np.asarray(refused | (vectors & np.isin(fix.ravel(), fix.ravel()[refused & vectors])))
 
 

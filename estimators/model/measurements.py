@@ -39,6 +39,8 @@ class Kind(IntEnum):
     barometer, 0 for a range finder above known ground."""
     ODOMETRY = 6
     """``direction . v`` in m/s, as `VELOCITY`, of another sensor than the receiver: neither vouches for the other."""
+    RELATIVE = 7
+    """``direction . (p_agent - p_other)``, both at the row's instant, in m."""
 
 
 ROW = np.dtype(
@@ -48,12 +50,12 @@ ROW = np.dtype(
         ("value", np.float64),  # m or m/s
         ("variance", np.float64),  # of the noise, unit of value squared
         ("half_width", np.float64),  # hard bound on the noise; inf where the sensor has none
-        ("x", np.float64),  # unit direction (POSITION, velocities), anchor (ANCHOR_RANGE), shift s (others), NED
+        ("x", np.float64),  # unit direction of linear rows, anchor (ANCHOR_RANGE), shift s (others), NED
         ("y", np.float64),
         ("z", np.float64),
         ("kind", np.int32),
         ("agent", np.int32),  # slot of the agent measured
-        ("other", np.int32),  # slot of the range's other end, -1 otherwise
+        ("other", np.int32),  # slot of the other end (RANGE, RELATIVE), -1 otherwise
         ("observer", np.int32),  # slot of the agent whose sensor it is
     ],
     align=True,
@@ -293,6 +295,36 @@ def height_row(
         agent=agent,
         observer=agent,
     )
+
+
+def relative_rows(
+    tick: int,
+    observer: int,
+    target: int,
+    place_m: ArrayLike,
+    along_variance: float | None,
+    across_variance: float,
+    *,
+    offset_s: float = 0.0,
+) -> RowTable:
+    """The rows of where ``observer`` sees ``target``: ``place_m`` ``(3,)`` is p_target - p_observer, NED m.
+
+    It must not be zero. ``along_variance`` of the distance (``None``: only the direction was seen),
+    ``across_variance`` across it.
+    """
+    place = np.asarray(place_m, float)
+    away_m = float(np.linalg.norm(place))
+    sight = place / away_m
+    first = np.zeros(3)
+    first[int(np.argmin(np.abs(sight)))] = 1.0
+    first -= (first @ sight) * sight
+    first /= np.linalg.norm(first)
+    axes = np.array([-sight, first, np.cross(sight, first)])
+    variances = np.array([np.inf if along_variance is None else along_variance, across_variance, across_variance])
+    values, unbounded = np.array([away_m, 0.0, 0.0]), np.full(3, np.inf)
+    rows = _vector_rows(Kind.RELATIVE, tick, observer, offset_s, None, axes, values, variances, unbounded)
+    rows["other"] = target
+    return rows if along_variance is not None else rows[1:]
 
 
 def input_rows(tick: int, agent: int, accel_mps2: ArrayLike, variance: ArrayLike) -> InputTable:

@@ -27,6 +27,7 @@ RANGE = int(Kind.RANGE)
 ANCHOR_RANGE = int(Kind.ANCHOR_RANGE)
 HEIGHT = int(Kind.HEIGHT)
 ODOMETRY = int(Kind.ODOMETRY)
+RELATIVE = int(Kind.RELATIVE)
 LAST_KIND = int(max(Kind))
 
 OFFSET, VALUE, PRECISION, HALF_WIDTH, X, Y, Z = range(7)
@@ -36,8 +37,8 @@ OFFSET, VALUE, PRECISION, HALF_WIDTH, X, Y, Z = range(7)
 def mark_usable(rows: RowTable, agents: int, usable: NDArray[np.bool_]) -> None:
     """usable ``(m,)`` <- whether an estimator of so many agents can use each row.
 
-    Finite, with a positive variance and bound, of a known kind, of agents in the fleet; a range between two of
-    them.
+    Finite, with a positive variance and bound, of a known kind, of agents in the fleet; a range, or a relative
+    position, between two of them.
     """
     for r in range(rows.shape[0]):
         row = rows[r]
@@ -46,7 +47,7 @@ def mark_usable(rows: RowTable, agents: int, usable: NDArray[np.bool_]) -> None:
         finite = np.isfinite(row["offset_s"]) and np.isfinite(row["value"]) and np.isfinite(row["variance"])
         finite = finite and np.isfinite(row["x"]) and np.isfinite(row["y"]) and np.isfinite(row["z"])
         known = 0 <= row["agent"] < agents and 0 <= row["observer"] < agents and 0 <= kind <= LAST_KIND
-        paired = (0 <= other < agents and other != row["agent"]) if kind == RANGE else other == -1
+        paired = (0 <= other < agents and other != row["agent"]) if kind in (RANGE, RELATIVE) else other == -1
         usable[r] = finite and row["variance"] > 0.0 and row["half_width"] > 0.0 and known and paired
 
 
@@ -111,6 +112,16 @@ def predict_row(code: IntArray, data: Matrix, r: int, x: Vector, eps: float, uni
             unit[2] = 1.0
             unit[3] = 0.0
             return float(e2)
+        if kind == RELATIVE:
+            b = code[r, 2]
+            unit[0] = data[r, X]
+            unit[1] = data[r, Y]
+            unit[2] = data[r, Z]
+            unit[3] = 0.0
+            e0 -= x[b] + offset * x[b + 3]
+            e1 -= x[b + 1] + offset * x[b + 4]
+            e2 -= x[b + 2] + offset * x[b + 5]
+            return float(unit[0] * e0 + unit[1] * e1 + unit[2] * e2)
         if kind == RANGE:
             b = code[r, 2]
             e0 -= x[b] + offset * x[b + 3] - data[r, X]

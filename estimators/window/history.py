@@ -118,9 +118,9 @@ class MeasurementWindow:
         count, refused, dropped = _take_in(table, self._rows, new, agents, self.first, self._last_heard)
         self._rows = table[:count]
         for slot in self.layout.target_slots:  # nothing is told by it, only of it
-            ranged = new["tick"][(new["kind"] == Kind.RANGE) & (new["other"] == slot)]
-            if len(ranged):
-                self.hear(slot, int(ranged.max()))
+            seen = new["tick"][new["other"] == slot]
+            if len(seen):
+                self.hear(slot, int(seen.max()))
         self.refused += refused
         self.dropped += dropped
 

@@ -161,7 +161,7 @@ def _range_noise(
     rows: RowTable, predicted: Vector, bodies: Sequence[int], model: LocalModel
 ) -> tuple[Vector, NDArray[np.bool_]]:
     """Variance of each row, with that of a neighbour's place, and whether the row is used."""
-    to_neighbour = (rows["kind"] == Kind.RANGE) & ~_among(rows["other"], bodies)
+    to_neighbour = np.isin(rows["kind"], (Kind.RANGE, Kind.RELATIVE)) & ~_among(rows["other"], bodies)
     variance = rows["variance"] + np.where(to_neighbour, model.neighbour_sigma_m**2, 0.0)
     return variance, ~to_neighbour | (np.abs(rows["value"] - predicted) <= model.range_gate_m)
 

@@ -19,6 +19,8 @@ from estimators.window.slow_window import IGNORED_FACTOR, SlowProblem, solve_slo
 
 STEPS = 2
 """Linear rows need one; the second one sees that it was enough."""
+LINEAR = (Kind.POSITION, Kind.VELOCITY, Kind.HEIGHT, Kind.ODOMETRY, Kind.RELATIVE)
+"""Kinds of rows without a norm."""
 KNOWN_SIGMA_MPS = 0.5
 """A velocity that is known better is on the right side of the sphere of a flying drone's speed."""
 
@@ -37,7 +39,7 @@ def guess_of_linear_rows(
 
     None where all rows are linear, and where there are none. Raises ``ArithmeticError`` as `solve_slow` does.
     """
-    linear = np.isin(problem.rows["kind"], (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY, Kind.HEIGHT))
+    linear = np.isin(problem.rows["kind"], LINEAR)
     if linear.all() or not linear.any():
         return None
     data = problem.window.data.copy()

@@ -17,6 +17,7 @@ from estimators.model.row_kernels import (
     ODOMETRY,
     POSITION,
     PRECISION,
+    RELATIVE,
     VALUE,
     VELOCITY,
     IntArray,
@@ -119,7 +120,7 @@ def slow_problem(
 
 @entry("void(ROW[::1], int64, float64[:, ::1], int64[:, ::1], float64[:, ::1], int64[::1])", ROW=ROW)
 def _encode(rows: RowTable, agents: int, white: Matrix, code: IntArray, data: Matrix, group: IntArray) -> None:
-    """Fill what `SlowWindow` holds of the rows; those of one fix, or one velocity, have one weight."""
+    """Fill what `SlowWindow` holds of the rows; those of one fix, velocity or sighting have one weight."""
     encode_rows(rows, np.arange(agents), code, data)
     for r in range(rows.shape[0]):
         row = rows[r]
@@ -128,9 +129,9 @@ def _encode(rows: RowTable, agents: int, white: Matrix, code: IntArray, data: Ma
             for i, direction in enumerate((row["x"], row["y"], row["z"])):
                 scale += (direction * white[row["agent"], i]) ** 2
             data[r, PRECISION] /= scale
-        before = rows[r - 1]
-        vector = row["kind"] == POSITION or row["kind"] == VELOCITY or row["kind"] == ODOMETRY
-        same = r > 0 and vector and row["kind"] == before["kind"]
+        kind, before = row["kind"], rows[r - 1]
+        vector = kind in (POSITION, VELOCITY, ODOMETRY, RELATIVE)
+        same = r > 0 and vector and kind == before["kind"] and row["other"] == before["other"]
         same = same and row["tick"] == before["tick"] and row["observer"] == before["observer"]
         same = same and row["agent"] == before["agent"] and row["offset_s"] == before["offset_s"]
         group[r] = group[r - 1] if same else r

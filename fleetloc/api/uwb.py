@@ -13,6 +13,7 @@ from agent.radio.security import driver_session
 from fleetloc.whole_config import load_whole
 from transport.link.session import Handlers, Session, open_session
 from transport.link.streams import Stream, key_expression
+from transport.messages.detection_body import Detection, DetectionFrame, encode_detections
 from transport.messages.uwb_body import UwbFrame, UwbRange, encode_uwb_json
 
 
@@ -72,10 +73,27 @@ class UwbDriver:
         the arrival; by default now. Raises `EncodeError` (a `ValueError`) for ranges that make no frame, and
         `RuntimeError` outside of the context.
         """
+        taken_ns = _now_ns(clock) if taken_ns is None else taken_ns
+        return self._put(encode_uwb_json(UwbFrame(self.frames, clock, taken_ns, tuple(ranges), self.agent_id)))
+
+    def publish_detections(
+        self,
+        detections: Sequence[Detection],
+        taken_ns: int | None = None,
+        clock: Literal["mono", "unix", "none"] = "mono",
+        axes: Literal["body", "ned"] = "body",
+    ) -> bool:
+        """The same of what a camera saw of targets, in ``axes`` of the drone's body, FRD, or NED."""
+        taken_ns = _now_ns(clock) if taken_ns is None else taken_ns
+        frame = DetectionFrame(self.frames, clock, taken_ns, tuple(detections), self.agent_id, axes)
+        return self._put(encode_detections(frame))
+
+    def _put(self, frame: bytes) -> bool:
         if self._session is None:
             raise RuntimeError("publish within `async with UwbDriver(...) as driver`")
-        if taken_ns is None:
-            taken_ns = time.time_ns() if clock == "unix" else time.monotonic_ns()
-        frame = encode_uwb_json(UwbFrame(self.frames, clock, taken_ns, tuple(ranges), self.agent_id))
         self.frames += 1
         return self._session.publish(Stream.UWB, frame)
+
+
+def _now_ns(clock: Literal["mono", "unix", "none"]) -> int:
+    return time.time_ns() if clock == "unix" else time.monotonic_ns()

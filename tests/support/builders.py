@@ -22,6 +22,7 @@ from estimators.model.measurements import (
     input_rows,
     position_rows,
     range_row,
+    relative_rows,
     speed_row,
     velocity_rows,
 )
@@ -60,7 +61,7 @@ def fly(rng: np.random.Generator, agents: int, ticks: int, dt: float) -> tuple[A
 def row_of(
     kind: Kind, rng: np.random.Generator, tick: int, agent: int, agents: int, offset_s: float = 0.0
 ) -> RowTable:
-    """One sensor reading without a value; a RANGE goes to another agent, so it needs two."""
+    """One sensor reading without a value; a RANGE or RELATIVE is of another agent too, so it needs two."""
     direction = rng.normal(size=3)
     variance = float(np.exp(rng.uniform(np.log(1e-3), np.log(0.1))))
     if kind is Kind.POSITION:
@@ -75,6 +76,8 @@ def row_of(
     if kind is Kind.HEIGHT:
         return height_row(tick, agent, 0.0, variance, offset_s=offset_s, drifts=bool(rng.random() < 0.7))
     other = int((agent + rng.integers(1, agents)) % agents)
+    if kind is Kind.RELATIVE:
+        return relative_rows(tick, agent, other, direction, variance, 4.0 * variance, offset_s=offset_s)
     return range_row(tick, agent, other, 0.0, variance, offset_s=offset_s)
 
 
@@ -117,7 +120,7 @@ def random_window(
                 kind = kinds[rng.integers(len(kinds))]
                 offset = float(rng.uniform(-dt / 2, dt / 2)) if with_offsets else 0.0
                 row = row_of(kind, rng, tick, agent, agents, offset)
-                if kind is Kind.RANGE:
+                if kind in (Kind.RANGE, Kind.RELATIVE):
                     choice = [other for other in measured_agents if other != agent]
                     row["other"] = choice[rng.integers(len(choice))]
                 window.insert(measured(row, states, eps, rng), empty_inputs())

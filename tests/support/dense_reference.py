@@ -52,6 +52,9 @@ def predicted_row(row: np.void, x: Array, eps: float) -> float:
         return float(direction @ v)
     if row["kind"] == Kind.SPEED:
         return float(np.sqrt(v @ v + eps**2))
+    if row["kind"] == Kind.RELATIVE:
+        b = int(row["other"])
+        return float(direction @ (p + o * v - x[6 * b : 6 * b + 3] - o * x[6 * b + 3 : 6 * b + 6]))
     if row["kind"] == Kind.RANGE:
         b = int(row["other"])
         away = p + o * v - x[6 * b : 6 * b + 3] - o * x[6 * b + 3 : 6 * b + 6]
@@ -85,6 +88,10 @@ def jacobian(rows: RowTable, x: Array, eps: float) -> Array:
             away = x[p] + o * x[v] - direction
             unit = away / np.sqrt(away @ away + eps**2)
             out[r, p], out[r, v] = unit, o * unit
+        elif row["kind"] == Kind.RELATIVE:
+            b = int(row["other"])
+            q, w = slice(6 * b, 6 * b + 3), slice(6 * b + 3, 6 * b + 6)
+            out[r, p], out[r, v], out[r, q], out[r, w] = direction, o * direction, -direction, -o * direction
         else:
             b = int(row["other"])
             q, w = slice(6 * b, 6 * b + 3), slice(6 * b + 3, 6 * b + 6)

@@ -78,6 +78,9 @@ def _predicted(casadi: Any, row: np.void, x: Any, eps: float) -> Any:
             return casadi.dot(direction, velocity)
         case Kind.SPEED:
             return casadi.sqrt(casadi.sumsqr(velocity) + eps**2)
+        case Kind.RELATIVE:
+            b = 6 * int(row["other"])
+            return casadi.dot(direction, place - x[b : b + 3] - o * x[b + 3 : b + 6])
         case Kind.RANGE:
             b = 6 * int(row["other"])
             away = place - x[b : b + 3] - o * x[b + 3 : b + 6]

@@ -94,8 +94,8 @@ class JointWindow:
         self.size = self.d + self.q + self.ticks * 3 * agents
         self.moves, self.offsets = self._affine(agents, period_s)
         keys = [
-            (r,) if row["kind"] not in (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY)
-            else tuple(float(row[name]) for name in ("tick", "observer", "kind", "agent", "offset_s"))
+            (r,) if row["kind"] not in (Kind.POSITION, Kind.VELOCITY, Kind.ODOMETRY, Kind.RELATIVE)
+            else tuple(float(row[name]) for name in ("tick", "observer", "kind", "agent", "other", "offset_s"))
             for r, row in enumerate(rows)
         ]  # fmt: skip
         self.group = np.array([keys.index(key) for key in keys], np.int64)
@@ -189,11 +189,15 @@ class JointWindow:
             cost = self.cost(z)
             if np.abs(length * step).max() < 1e-12:
                 break
-        for _ in range(iterations):  # the cost is down to its rounding: half steps contract where whole ones swing
+        # the cost is down to its rounding: half steps contract where whole ones swing, where norms bend smaller parts
+        share, before = 0.5, np.inf
+        for _ in range(iterations):
             step = self.gauss_newton(z)[1]
-            if np.abs(step).max() < 1e-11:
+            size = float(np.abs(step).max())
+            if size < 1e-11:
                 break
-            z = z + 0.5 * step
+            share, before = 0.5 * share if size > before else share, size
+            z = z + share * step
         cost, step = self.cost(z), self.gauss_newton(z)[1]
         return JointOptimum(z, self.path(z), z[self.d : self.d + self.q], cost, float(np.abs(step).max()))
 

@@ -62,7 +62,7 @@ def draw_window(
 
     All of it is correlated, or else only the states are, and the slow errors are as their priors.
     """
-    kinds = [kind for kind in kinds if agents > 1 or kind is not Kind.RANGE]
+    kinds = [kind for kind in kinds if agents > 1 or kind not in (Kind.RANGE, Kind.RELATIVE)]
     truth, accel = builders.fly(rng, agents, ticks, DT)
     count = slow_errors.count(agents) if slow else 0
     scales = np.concatenate([np.full(6 * agents, prior_m), rng.uniform(0.05, 0.5, count)])

@@ -53,9 +53,13 @@ MAX_OFFSET_S = 10.0
 MAX_POSITION_M = 1e6
 MAX_SPEED_MPS = 1e4
 MAX_RANGE_M = 1e5
+UNSEEN_VARIANCE = 1e6
+"""Stands for a distance that was not measured (the wire has no gap)."""
 MAX_ACCEL_MPS2 = 1e4
 MAX_TURN = 64.0
 """Of a rotation vector's components in rad and of turn rates in rad/s."""
+ROUNDED = 1e-5
+"""What a direction of length one may be off by, as float32."""
 RECORDS_KNOWN_AGAIN = 4096
 """How many decoded records are known again by their bytes: more than a fleet of ten sends anew in its history."""
 BODIES_KNOWN_AGAIN = 128
@@ -76,6 +80,7 @@ class MeasurementKind(IntEnum):
     ANTENNA_SPEED = 9
     HEIGHT = 10
     GROUND_HEIGHT = 11
+    SIGHTING = 12
     ODOMETRY = 13
 
 
@@ -213,6 +218,29 @@ class TagRangeMeasurement(RangeMeasurement):
 
 
 @dataclass(frozen=True)
+class SightingMeasurement(RangeMeasurement):
+    """Where ``observer`` sees ``other``: ``range_m`` away along ``direction``, NED, of length one.
+
+    ``variance_m2`` of the distance, `UNSEEN_VARIANCE` and more where it was not seen but follows from the estimate;
+    ``variance_across_m2`` about each axis across the direction.
+    """
+
+    kind = MeasurementKind.SIGHTING
+
+    direction: Triple = (1.0, 0.0, 0.0)
+    variance_across_m2: float = 1.0
+
+    @property
+    def is_bearing(self) -> bool:
+        """Whether only the direction was seen."""
+        return self.variance_m2 >= UNSEEN_VARIANCE
+
+    def parts(self) -> _Parts:
+        variances = self.variance_m2, self.variance_across_m2
+        return _Parts((self.offset_s, self.other), (self.range_m, *self.direction), variances, ())
+
+
+@dataclass(frozen=True)
 class AntennaSpeedMeasurement(SpeedMeasurement):
     """The norm of the velocity of ``observer``'s GPS antenna, which moves against it with ``shift_mps`` NED."""
 
@@ -334,6 +362,7 @@ _LAYOUT: dict[int, struct.Struct] = {
     MeasurementKind.ANTENNA_SPEED: struct.Struct("<BHBff3eee"),
     MeasurementKind.HEIGHT: struct.Struct("<BHBffe"),
     MeasurementKind.GROUND_HEIGHT: struct.Struct("<BHBffe"),
+    MeasurementKind.SIGHTING: struct.Struct("<BHBfHf3fee"),
     MeasurementKind.ODOMETRY: struct.Struct("<BHBf3f3e"),
 }
 _HEIGHTS: dict[int, type[HeightMeasurement]] = {
@@ -521,6 +550,10 @@ def _check_place(record: _Record, middle: _Floats) -> None:
     for offset in middle[:1]:
         if not -MAX_OFFSET_S <= offset <= MAX_OFFSET_S:
             raise EncodeError(f"{record}: offset must be within +-{MAX_OFFSET_S:g} s")
+    if isinstance(record, SightingMeasurement):
+        off = abs(math.hypot(*record.direction) - 1.0)
+        if not (record.range_m > 0.0 and off <= ROUNDED):
+            raise EncodeError(f"{record}: expected a positive distance and a direction of length one")
     if isinstance(record, AnchorRangeMeasurement):
         for component in record.anchor_m:
             if not -MAX_POSITION_M <= component <= MAX_POSITION_M:
@@ -561,6 +594,8 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
     if kind in _HEIGHTS:
         down_m = _bounded(fields[4:5], MAX_POSITION_M, "height")[0]
         return _HEIGHTS[kind](observer, tick, down_m, _variances(fields[5:])[0], offset)
+    if kind == MeasurementKind.SIGHTING:
+        return _sighting(observer, tick, offset, fields)
     sigma, half_width = _variances(fields[-2:-1])[0], _widths(fields[-1:])[0]
     if kind == MeasurementKind.SPEED:
         speed = _bounded(fields[4:5], MAX_SPEED_MPS, "speed")[0]
@@ -580,6 +615,18 @@ def _record_from(wire: bytes, tick: int) -> Measurement:
     anchor = _triple(_bounded(fields[4:7], MAX_POSITION_M, "anchor"))
     range_m = _bounded(fields[7:8], MAX_RANGE_M, "range")[0]
     return AnchorRangeMeasurement(observer, tick, anchor, range_m, sigma, half_width, offset)
+
+
+def _sighting(observer: int, tick: int, offset: float, fields: _Floats) -> SightingMeasurement:
+    other = int(fields[4])
+    if other == observer:
+        raise Rejected(Reason.OUT_OF_RANGE, f"sighting of agent {observer} by itself")
+    range_m = _bounded(fields[5:6], MAX_RANGE_M, "distance")[0]
+    direction = _triple(_bounded(fields[6:9], 1.0 + ROUNDED, "direction"))
+    if range_m <= 0.0 or abs(math.hypot(*direction) - 1.0) > ROUNDED:
+        raise Rejected(Reason.OUT_OF_RANGE, f"sighting at {range_m:g} m along {direction}")
+    along, across = _variances(fields[9:11])
+    return SightingMeasurement(observer, tick, other, range_m, along, math.inf, offset, direction, across)
 
 
 def _bounded(values: _Floats, limit: float, what: str) -> _Floats:

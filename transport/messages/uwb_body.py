@@ -9,8 +9,9 @@ from __future__ import annotations
 import math
 import struct
 from collections import OrderedDict
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Generic, Literal, Protocol, TypeVar
 
 import msgspec
 
@@ -145,14 +146,55 @@ def encode_uwb_binary(frame: UwbFrame) -> bytes:
         raise EncodeError(f"uwb frame: {error}") from None
 
 
-class UwbIntake:
+class LocalFrame(Protocol):
+    """What the frames of all local sensors have."""
+
+    @property
+    def seq(self) -> int:
+        """Counts the driver's frames."""
+        ...
+
+    @property
+    def clock(self) -> Clock:
+        """Of ``t_ns``."""
+        ...
+
+    @property
+    def t_ns(self) -> int:
+        """When it was measured."""
+        ...
+
+    @property
+    def observer(self) -> int | None:
+        """Whose sensor it is, if it says so."""
+        ...
+
+    @property
+    def skipped(self) -> int:
+        """Unusable measurements in it."""
+        ...
+
+
+FrameT = TypeVar("FrameT", bound=LocalFrame)
+
+
+class FrameIntake(Generic[FrameT]):
     """Decodes one observer's frames and refuses old and repeated ones; sans-I/O.
 
-    Refused frames are counted in ``rejections``, unusable measurements within good frames in ``skipped``.
+    Refused frames are counted in ``rejections``, unusable measurements within good frames in ``skipped``. ``decode``
+    raises `Rejected`; ``what`` names the frames in words.
     """
 
-    def __init__(self, observer: int, *, max_age_s: float = MAX_AGE_S, remembered: int = 256) -> None:
-        self._observer = observer
+    def __init__(
+        self,
+        observer: int,
+        decode: Callable[[bytes], FrameT],
+        what: str,
+        *,
+        max_age_s: float = MAX_AGE_S,
+        remembered: int = 256,
+    ) -> None:
+        self._observer, self._decode, self._what = observer, decode, what
         self._max_age_s = max_age_s
         self._remembered = remembered
         self._seen: OrderedDict[tuple[int, int], None] = OrderedDict()
@@ -160,10 +202,10 @@ class UwbIntake:
         self.received = 0
         self.skipped = 0
 
-    def accept(self, payload: bytes, *, unix_s: float, monotonic_s: float) -> tuple[UwbFrame, float] | None:
+    def accept(self, payload: bytes, *, unix_s: float, monotonic_s: float) -> tuple[FrameT, float] | None:
         """The frame and its age in s on its own clock (0 if it has none); ``None`` if it was refused."""
         try:
-            frame = decode_uwb(payload)
+            frame = self._decode(payload)
             age_s = self._checked_age(frame, unix_s, monotonic_s)
         except Rejected as rejected:
             self.rejections.count(rejected.reason)
@@ -172,22 +214,29 @@ class UwbIntake:
         self.skipped += frame.skipped
         return frame, age_s
 
-    def _checked_age(self, frame: UwbFrame, unix_s: float, monotonic_s: float) -> float:
+    def _checked_age(self, frame: FrameT, unix_s: float, monotonic_s: float) -> float:
         if frame.observer not in (None, self._observer):
             raise Rejected(Reason.WRONG_KEY, f"observer {frame.observer} on the key of {self._observer}")
         age_s = 0.0
         if frame.clock != "none":
             age_s = (unix_s if frame.clock == "unix" else monotonic_s) - frame.t_ns * 1e-9
         if abs(age_s) > self._max_age_s:
-            raise Rejected(Reason.STALE, f"uwb frame {age_s:.3f} s old, at most {self._max_age_s:g} s")
+            raise Rejected(Reason.STALE, f"{self._what} frame {age_s:.3f} s old, at most {self._max_age_s:g} s")
         # a restarted driver counts from 0 again: only the same number with the same time is the same frame
         identity = (frame.seq, frame.t_ns)
         if identity in self._seen:
-            raise Rejected(Reason.DUPLICATE, f"uwb frame {frame.seq}")
+            raise Rejected(Reason.DUPLICATE, f"{self._what} frame {frame.seq}")
         self._seen[identity] = None
         if len(self._seen) > self._remembered:
             self._seen.popitem(last=False)
         return age_s
+
+
+class UwbIntake(FrameIntake[UwbFrame]):
+    """That of ranges."""
+
+    def __init__(self, observer: int, *, max_age_s: float = MAX_AGE_S, remembered: int = 256) -> None:
+        super().__init__(observer, decode_uwb, "uwb", max_age_s=max_age_s, remembered=remembered)
 
 
 def _decode_json(payload: bytes) -> UwbFrame:

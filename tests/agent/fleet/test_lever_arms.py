@@ -15,7 +15,13 @@ from agent.fleet.measurement_store import ATTITUDE_TICKS, MeasurementStore
 from agent.sensing.frames import from_euler, rotated
 from agent.sensing.timeline import Orientation, _turned
 from tests.agent.conftest import fleet_config
-from transport.messages.measurement_body import OrientationMeasurement, RangeMeasurement, TagRangeMeasurement, as_sent
+from transport.messages.measurement_body import (
+    OrientationMeasurement,
+    RangeMeasurement,
+    SightingMeasurement,
+    TagRangeMeasurement,
+    as_sent,
+)
 
 ARMS = {1: ((0.3, 0.0, 0.0), (0.0, 0.5, -0.1)), 2: ((0.0, 0.2, 0.1),), 3: ()}
 ANGLE = st.floats(-3.0, 3.0)
@@ -104,3 +110,18 @@ def test_a_range_waits_for_how_the_other_end_lay_and_then_counts_for_less() -> N
     assert rows["value"].tolist() == [8.0]
     assert rows[0]["variance"] == pytest.approx(0.01 + (0.2**2 + 0.1**2) / 3, rel=1e-2)
     assert store.unturned == 1
+
+
+def test_a_sighting_waits_for_nobodys_attitude_and_does_not_count_as_a_range() -> None:
+    # GIVEN drones with arms that have said nothing of how they lie, THEN what one sees of the other is used at once
+    store = MeasurementStore(config(), 1)
+    store.add_own(SightingMeasurement(1, 100, 2, 9.0, 0.01))
+    rows, _ = store.take(100, (1, 2, 3), (1, 2, 3))
+    assert rows["value"].tolist() == [9.0, 0.0, 0.0]
+    assert store.unturned == 0
+    # and one of somebody who was never located is no range that was left out
+    store.add_own(SightingMeasurement(1, 101, 3, 7.0, 0.01))
+    store.add_own(RangeMeasurement(1, 101, 3, 7.0, 0.01))
+    store.forget(200)
+    assert store.refused["not located"] == 2
+    assert store.unused_ranges == 1

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -22,10 +23,13 @@ from agent.fleet.measurements import (
     inputs_of,
     range_measurement,
     rows_of,
+    sighting_measurement,
 )
 from agent.sensing.barometer import SIGMA_M
+from agent.sensing.detections import DetectionSample
 from agent.sensing.samples import BaroSample, GpsSample, RangeSample
 from agent.sensing.timeline import TickInput
+from estimators.integrity.observability import row_jacobian
 from estimators.model import measurements
 from estimators.model.measurements import Kind
 from tests.agent.conftest import fleet_config
@@ -40,6 +44,7 @@ from transport.messages.measurement_body import (
     RangeMeasurement,
     SpeedMeasurement,
     VelocityMeasurement,
+    as_sent,
 )
 
 SLOTS = {1: 0, 2: 1, 3: 2}
@@ -87,6 +92,43 @@ def test_heights_that_drift_are_not_for_an_estimator_without_slow_errors(known: 
     heights = [HeightMeasurement(2, 100, -12.5, 0.1), GroundHeightMeasurement(2, 100, -12.5, 0.1)]
     assert len(store.add_heard(2, heights, 100)) == taken
     assert store.refused["heard: not used"] == 2 - taken
+
+
+SEEN = DetectionSample(10.03, 3, "ned", (0.6, 0.0, 0.8), 0.02, 50.0, 2.0)
+
+
+@given(st.integers(0, 999))
+def test_a_detection_becomes_rows_that_hold_where_the_target_is(seed: int) -> None:
+    # GIVEN a drone that sees a target, both in motion
+    rng = np.random.default_rng(seed)
+    state = rng.normal(size=18) * 20.0
+    offset_s = 0.03
+    now = [state[6 * s : 6 * s + 3] + offset_s * state[6 * s + 3 : 6 * s + 6] for s in (1, 2)]
+    away = now[1] - now[0]
+    distance_m = float(np.linalg.norm(away))
+    direction = tuple((away / distance_m).tolist())
+    sample = replace(SEEN, direction=direction, distance_m=distance_m)
+    # THEN the rows of its record are met exactly at that state, along the sight and across it, as sure as was said
+    rows = rows_of([sighting_measurement(2, sample, direction, 0.0, 0.1)], SLOTS)
+    predicted, _ = row_jacobian(rows, state, 1e-3)
+    np.testing.assert_allclose(predicted, rows["value"], atol=1e-9 * (1.0 + distance_m))
+    assert rows["kind"].tolist() == [Kind.RELATIVE] * 3
+    assert rows["variance"] == pytest.approx([4.0, (0.02 * distance_m) ** 2, (0.02 * distance_m) ** 2])
+    axes = np.stack([rows["x"], rows["y"], rows["z"]], axis=1)
+    np.testing.assert_allclose(axes @ axes.T, np.eye(3), atol=1e-12)
+    assert rows["agent"].tolist() == [1] * 3
+    assert rows["other"].tolist() == [2] * 3
+
+
+def test_of_a_bearing_only_what_is_across_it_becomes_rows() -> None:
+    sample = replace(SEEN, distance_m=None, distance_sigma_m=None)
+    record = sighting_measurement(2, sample, sample.direction, 80.0, 0.1)
+    assert record.is_bearing
+    rows = rows_of([as_sent(record)], SLOTS)
+    assert rows["value"].tolist() == [0.0, 0.0]
+    assert rows["variance"] == pytest.approx([(0.02 * 80.0) ** 2] * 2, rel=5e-3)
+    axes = np.stack([rows["x"], rows["y"], rows["z"]], axis=1)
+    np.testing.assert_allclose(axes @ sample.direction, 0.0, atol=1e-6)
 
 
 def test_configured_half_widths_set_variance_and_bound() -> None:

@@ -12,7 +12,13 @@ from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import FixTracks
 from agent.fleet.locating import RangeLocator
 from agent.fleet.motions import Motions
-from transport.messages.measurement_body import PositionMeasurement, RangeMeasurement, VelocityMeasurement
+from transport.messages.measurement_body import (
+    UNSEEN_VARIANCE,
+    PositionMeasurement,
+    RangeMeasurement,
+    SightingMeasurement,
+    VelocityMeasurement,
+)
 
 TARGET = 101
 DRONES_M = np.array([[0, 0, -40], [60, 0, -45], [0, 60, -55], [60, 60, -70], [30, 90, -50]], float)
@@ -72,6 +78,43 @@ def test_the_prior_holds_a_ninth_of_what_the_ranges_say() -> None:
     prior = np.linalg.inv(found[1][:3, :3])
     assert np.linalg.eigvalsh(information / 9.0 - prior).min() > 0.0
     assert np.linalg.eigvalsh(prior - information / 90.0).min() > 0.0  # and it is no empty one
+
+
+@pytest.mark.parametrize("ahead", [0, 1, 2, 3])
+def test_a_target_that_two_drones_see_is_located_by_the_latest_sightings(ahead: int) -> None:
+    # GIVEN two drones that saw a rover with its distance in every tick, well in direction and poorly in distance
+    fleet, rng = config("moving"), np.random.default_rng(4 + ahead)
+    locator, rover = RangeLocator(fleet, Motions(fleet)), np.array((20.0, 30.0, 0.0))
+    for tick in range(4):
+        locator.note_places(tick, {i: (np.array((*DRONES_M[i - 1], 0, 0, 0)), 0.01 * np.eye(3)) for i in (1, 2)})
+        for i in (1, 2):
+            away = rover + 2.0 * tick * np.array((1.0, 0.0, 0.0)) - DRONES_M[i - 1]
+            distance_m = float(np.linalg.norm(away))
+            direction = away / distance_m + 0.01 * rng.normal(size=3)
+            direction /= np.linalg.norm(direction)
+            seen_m = distance_m + 3.0 * float(rng.normal())
+            across = (0.01 * distance_m) ** 2
+            locator.note(
+                SightingMeasurement(i, tick, TARGET, seen_m, 9.0, math.inf, 0.0, tuple(direction.tolist()), across)
+            )
+    # THEN it has a place, at an earlier tick less sure for its motion, and the error is within the covariance
+    found = locator.place_target(TARGET, at_tick=3 - ahead, until_tick=4)
+    assert found is not None
+    mean, covariance = found
+    error = mean[:3] - (rover + 2.0 * (3 - ahead) * np.array((1.0, 0.0, 0.0)))
+    assert error @ np.linalg.solve(covariance[:3, :3], error) < 16.0
+    assert np.sqrt(covariance[0, 0]) > 3.0 * ahead  # a moving target may have run
+    assert np.linalg.norm(error) < 4.0 + 2.0 * ahead
+
+
+def test_bearings_alone_locate_nothing() -> None:
+    fleet = config("fixed")
+    locator = RangeLocator(fleet, Motions(fleet))
+    locator.note_places(0, {1: (np.array((*DRONES_M[0], 0, 0, 0)), 0.01 * np.eye(3))})
+    locator.note(
+        SightingMeasurement(1, 0, TARGET, 50.0, UNSEEN_VARIANCE, math.inf, 0.0, (0.0, 0.0, 1.0), 0.25)
+    )
+    assert locator.place_target(TARGET, at_tick=0, until_tick=1) is None
 
 
 def test_without_enough_ranges_there_is_none() -> None:

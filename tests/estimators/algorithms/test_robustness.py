@@ -67,7 +67,8 @@ def random_rows(rng: np.random.Generator, agents: int, ticks: int, variances: tu
     rows["tick"] = rng.integers(0, ticks + 1, count)
     rows["kind"] = rng.integers(0, len(Kind), count)
     rows["agent"] = rng.integers(0, agents, count)
-    rows["other"] = np.where(rows["kind"] == Kind.RANGE, (rows["agent"] + 1) % agents, -1)
+    paired = np.isin(rows["kind"], (Kind.RANGE, Kind.RELATIVE))
+    rows["other"] = np.where(paired, (rows["agent"] + 1) % agents, -1)
     rows["observer"] = rows["agent"]
     rows["offset_s"] = rng.uniform(-0.05, 0.05, count) * rng.integers(0, 2, count)
     rows["value"] = rng.choice([0.0, 1.0, -3.0, 17.0, 100.0], count)
@@ -77,7 +78,7 @@ def random_rows(rng: np.random.Generator, agents: int, ticks: int, variances: tu
     direction /= np.linalg.norm(direction, axis=1, keepdims=True)
     for i, name in enumerate("xyz"):
         rows[name] = direction[:, i]
-    return rows[rows["agent"] != rows["other"]]  # a single agent has nobody to range
+    return rows[rows["agent"] != rows["other"]]  # a single agent has nobody to range or see
 
 
 def random_problem(

@@ -12,6 +12,7 @@ from estimators.model.measurements import (
     anchor_range_row,
     position_rows,
     range_row,
+    relative_rows,
     speed_row,
     velocity_rows,
 )
@@ -50,6 +51,17 @@ def test_a_velocity_and_a_speed_are_impossible_beyond_a_hundred_metres_a_second(
 def test_a_range_is_impossible_a_kilometre_from_the_distance(off_m: float, expected: bool) -> None:
     assert refused(range_row(100, 0, 1, 49.4 + off_m, 0.01)) == [expected]
     assert refused(anchor_range_row(100, 0, [1.0, 100.0, -5.0], 100.0 + off_m, 0.01)) == [expected]
+
+
+@pytest.mark.parametrize(("off_m", "expected"), [(0.0, False), (900.0, False), (1100.0, True)])
+def test_a_sighting_is_impossible_as_a_whole_and_no_other_one_with_it(off_m: float, expected: bool) -> None:
+    # GIVEN what drone 1 sees of two others in one picture, of which it is wrong about the distance to the second
+    mean = np.concatenate((STATES, [1.0, 0.0, 45.0, 0.0, 0.0, 0.0]))
+    right = relative_rows(100, 0, 2, [0.0, 0.0, 50.0], 0.1, 0.1)
+    far = relative_rows(100, 0, 1, np.array([29.0, 40.0, 0.0]) / 49.4 * (49.4 + off_m), 0.1, 0.1)
+    monitor = PlausibilityMonitor(1, PERIOD_S)
+    monitor.observe(Presented(100, (1, 2, 3), np.concatenate((right, far)), 99, mean, np.full(18, 0.1)))
+    assert monitor.refused.tolist() == [False] * 3 + [expected] * 3
 
 
 def test_of_whom_nothing_is_believed_nothing_is_impossible() -> None:

@@ -11,8 +11,9 @@ import pytest
 import fleetloc
 from agent.config.tables import SensorsTable
 from agent.radio.security import agent_session
+from agent.sensing.detections import DetectionAdapter
 from agent.uwb.adapter import UwbAdapter
-from fleetloc import FleetObserver, UwbDriver, UwbRange
+from fleetloc import Detection, FleetObserver, UwbDriver, UwbRange
 from tests.fleetloc.monitor.test_monitor_live import fleet_file
 from tests.support.beacon import beacons
 from transport.link.session import Handlers, open_session
@@ -47,6 +48,26 @@ async def test_ranges_of_a_driver_reach_the_daemon_of_its_drone(config_file: Pat
     taken_s = json.loads(frame)["t"] * 1e-9
     samples = UwbAdapter(1, (2, 3), SensorsTable()).receive(frame, now_s=100.0, host_s=taken_s, unix_s=1.8e9)
     assert [(sample.target, sample.range_m) for sample in samples] == [(2, 12.5), (3, 7.0)]
+
+
+async def test_detections_of_a_camera_go_the_same_way(config_file: Path) -> None:
+    config = fleetloc.load_config(config_file)
+    frames: asyncio.Queue[bytes] = asyncio.Queue()
+    handlers = Handlers(lambda _key, payload, _arrived_s: frames.put_nowait(payload))
+    settings = agent_session(config, 1, config_file.parent)
+    daemon = await open_session(settings, config.fleet.name, 1, config.ids, handlers)
+    daemon.subscribe(1, (Stream.UWB,))
+    seen = Detection(101, (0.6, 0.0, 0.8), 0.01, 50.0, 2.0)
+    try:
+        async with UwbDriver(config_file, 1) as driver:
+            async with asyncio.timeout(PATIENCE_S):
+                while frames.empty():
+                    assert driver.publish_detections([seen], clock="none", axes="ned")
+                    await asyncio.sleep(0.05)
+    finally:
+        await daemon.close()
+    (sample,) = DetectionAdapter(1, {101}).receive(frames.get_nowait(), now_s=100.0, host_s=5.0, unix_s=1.8e9)
+    assert (sample.target, sample.direction, sample.distance_m) == (101, (0.6, 0.0, 0.8), 50.0)
 
 
 async def test_a_driver_says_what_is_wrong(config_file: Path) -> None:

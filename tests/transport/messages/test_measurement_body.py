@@ -26,6 +26,7 @@ from transport.messages.measurement_body import (
     OrientationMeasurement,
     PositionMeasurement,
     RangeMeasurement,
+    SightingMeasurement,
     SpeedMeasurement,
     TagRangeMeasurement,
     VelocityMeasurement,
@@ -80,9 +81,16 @@ ground_heights = st.builds(GroundHeightMeasurement, ids, ticks, numbers(1e6), va
 odometries = st.builds(
     OdometryMeasurement, ids, ticks, triples(numbers(1e4)), triples(variances), offsets
 )
+directions = triples(numbers(1.0)).filter(lambda vector: math.hypot(*vector) > 0.1).map(
+    lambda vector: tuple(axis / math.hypot(*vector) for axis in vector)
+)
+sightings = st.builds(
+    SightingMeasurement, ids, ticks, ids, st.floats(1e-3, 1e5), variances, st.just(math.inf), offsets, directions,
+    variances,
+).filter(lambda record: record.observer != record.other)
 records = st.one_of(
     positions, velocities, speeds, ranges, anchors, accelerations, tag_ranges, antenna_speeds, orientations, heights,
-    ground_heights, odometries,
+    ground_heights, odometries, sightings,
 )  # fmt: skip
 
 RANGE = RangeMeasurement(1, TICK, 2, 10.0, 0.01, 0.3, 0.02)
@@ -141,6 +149,7 @@ IDENTITY_ENDS = dict.fromkeys(MeasurementKind, 8) | {
     MeasurementKind.ACCELERATION: 4,
     MeasurementKind.ORIENTATION: 4,
     MeasurementKind.TAG_RANGE: 11,
+    MeasurementKind.SIGHTING: 10,
 }
 """Byte of a record at which its values begin: up to there it says which measurement it is."""
 
@@ -250,6 +259,10 @@ def test_what_says_nothing_or_is_too_old_is_left_out_and_counted() -> None:
         replace(SPEED, observer=1000),
         replace(RANGE, other=1),
         replace(RANGE, other=1000),
+        SightingMeasurement(1, TICK, 2, 0.0, 0.01),
+        SightingMeasurement(1, TICK, 2, 10.0, 0.01, direction=(1.0, 0.1, 0.0)),
+        SightingMeasurement(1, TICK, 2, 10.0, 0.01, variance_across_m2=0.0),
+        SightingMeasurement(1, TICK, 1, 10.0, 0.01),
         TagRangeMeasurement(1, TICK, 2, 10.0, 0.01, tag=16),
         TagRangeMeasurement(1, TICK, 2, 10.0, 0.01, other_tag=-1),
         OrientationMeasurement(1, TICK, (65.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
@@ -266,11 +279,17 @@ def test_no_bad_record_is_sent(bad: Measurement) -> None:
 
 SPEED_WIRE = "<BHBffee"
 RANGE_WIRE = "<BHBfHfee"
+SIGHTING_WIRE = "<BHBfHf3fee"
 
 
 @pytest.mark.parametrize(
     ("body", "count", "reason"),
     [
+        (struct.pack(SIGHTING_WIRE, 12, 1, 0, 0, 1, 5, 1, 0, 0, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SIGHTING_WIRE, 12, 1, 0, 0, 2, 0, 1, 0, 0, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SIGHTING_WIRE, 12, 1, 0, 0, 2, 5, 1, 0.1, 0, 1, 1), 1, Reason.OUT_OF_RANGE),
+        (struct.pack(SIGHTING_WIRE, 12, 1, 0, 0, 2, 5, math.nan, 0, 0, 1, 1), 1, Reason.NOT_FINITE),
+        (struct.pack(SIGHTING_WIRE, 12, 1, 0, 0, 2, 5, 1, 0, 0, 1, 0), 1, Reason.OUT_OF_RANGE),
         (struct.pack(SPEED_WIRE, 3, 1, 0, 0, math.nan, 1, 1), 1, Reason.NOT_FINITE),
         (struct.pack(SPEED_WIRE, 3, 1, 0, 0, math.inf, 1, 1), 1, Reason.NOT_FINITE),
         (struct.pack(SPEED_WIRE, 3, 1, 0, math.nan, 1, 1, 1), 1, Reason.NOT_FINITE),

@@ -20,7 +20,7 @@ from tests.support.frozen_cases import case_recording, load_case
 
 LEFT_OUT = {
     r"fleet (?!.*--lockstep)": "flies live, up to a minute; tests/fleet flies such fleets",
-    r"fleet configs/\S+ --duration 60 .*--lockstep": "a minute of flight for the tables; shorter ones are run",
+    r"fleet configs/\S+ (?=.*--lockstep)(?=.*--(seed|loss|duration 60))": "flights for tables; shorter ones are run",
     r"(fleet|survey) configs/awareness/survey.toml": "two minutes of flight; tests/fleetloc/report/test_survey.py",
     r"(agent|sim|monitor|ros2|uwb) ": "runs until it is stopped; tests/fleet and tests/fleetloc run them",
     r"sitl ": "needs autopilots in simulators",

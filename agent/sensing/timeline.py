@@ -169,7 +169,7 @@ class Timeline:
         accelerations = self._accelerations(start_s, end_s)
         self._judge(accelerations, start_s, end_s)
         points = [(t, a) for t, a in accelerations if a is not None]
-        covered_s, integral, missed = self._integral(points, start_s, end_s)
+        covered_s, integral, missed_mps = self._integral(points, start_s, end_s)
         self._closed_until_s = end_s
         self._forget(start_s - KEEP_S)
         inside = len([t for t, _ in points if start_s <= t < end_s])
@@ -181,7 +181,7 @@ class Timeline:
         aided = all(sample.aided for sample in self._attitudes if start_s <= sample.t_s < end_s)
         tilted = 0.0 if aided else TILTED_MPS2**2
         variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2 + tilted
-        variance += missed / covered_s**2
+        variance += (missed_mps / covered_s) ** 2
         north, east, down = (component / covered_s for component in integral)
         return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside, aided)
 
@@ -249,11 +249,11 @@ class Timeline:
     def _integral(
         self, points: list[tuple[float, Triple]], start_s: float, end_s: float
     ) -> tuple[float, Triple, float]:
-        """Covered time in s, integral in m/s over a tick, and its variance per axis, (m/s)2, by jumps."""
+        """Covered time in s, integral in m/s over a tick, and its 1-sigma per axis, m/s, by jumps."""
         gap_s = self._sensors.imu_max_gap_s
-        covered_s, north, east, down, missed = 0.0, 0.0, 0.0, 0.0, 0.0
+        covered_s, north, east, down, missed_mps = 0.0, 0.0, 0.0, 0.0, 0.0
         if not points:
-            return covered_s, (north, east, down), missed
+            return covered_s, (north, east, down), missed_mps
         # Before the first and after the last sample the nearest one holds, for as long as a gap may be.
         held = [(points[0][0] - gap_s, points[0][1]), *points, (points[-1][0] + gap_s, points[-1][1])]
         for (t0, a0), (t1, a1) in pairwise(held):
@@ -268,8 +268,8 @@ class Timeline:
             down += part_s * (a0[2] + middle * (a1[2] - a0[2]))
             jump = math.dist(a0, a1)
             if jump > JUMP_MPS2:
-                missed += (part_s * jump) ** 2 / 12.0
-        return covered_s, (north, east, down), missed
+                missed_mps = math.hypot(missed_mps, part_s * jump / math.sqrt(12.0))
+        return covered_s, (north, east, down), missed_mps
 
     def _forget(self, before_s: float) -> None:
         del self._imu[: bisect_left(self._imu, before_s, key=_time_of)]

@@ -55,7 +55,7 @@ def interior_point(joint: JointWindow, limits: StateLimits, half: Array, start: 
         for a in range(0, joint.d, 6):
             bound(casadi.sumsqr(x[a + 3 : a + 6]), -np.inf, limits.speed_mps**2)
     variables = casadi.vertcat(z, slack)
-    quiet = {"print_level": 0, "tol": 1e-11, "sb": "yes", "max_iter": 500, "bound_relax_factor": 0.0}
+    quiet = {"print_level": 0, "tol": 1e-10, "sb": "yes", "max_iter": 500, "bound_relax_factor": 0.0}
     program = {"x": variables, "f": 0.5 * cost, "g": casadi.vertcat(*bounded)}
     solver = casadi.nlpsol("reference", "ipopt", program, {"ipopt": quiet, "print_time": False})
     answer = solver(x0=np.concatenate([start, np.zeros(len(soft))]), lbg=low, ubg=high)

@@ -108,6 +108,7 @@ class _Waiting:
     variance_m2: float
     arms_m: Vector
     """``(3,)``: lever arm of the first end's antenna less that of the second's."""
+    measured_by: int
 
 
 class _Fixes:
@@ -160,7 +161,7 @@ class _Fixes:
 
 
 class _Scatter:
-    """Of a pair's ranges."""
+    """Of a pair's ranges that one end measured: those of the other may be off by something else, all the time."""
 
     def __init__(self) -> None:
         self._last: deque[tuple[float, float]] = deque(maxlen=3)
@@ -201,7 +202,8 @@ class Baselines:
         self._fixes: dict[int, _Fixes] = {}
         self._waiting: deque[_Waiting] = deque()
         self._open: dict[int, dict[Pair, list[_Held]]] = {}
-        self._scatter: dict[Pair, _Scatter] = {}
+        self._scatter: dict[tuple[int, int], _Scatter] = {}
+        """Of who measured, and to whom."""
         self._next: int | None = None
 
     def take(self, evidence: SharedTick) -> list[Bin]:
@@ -209,7 +211,7 @@ class Baselines:
         self._fixes = {agent: self._fixes.get(agent) or _Fixes() for agent in evidence.agents}
         self._scatter = {pair: each for pair, each in self._scatter.items() if set(pair) <= self._fixes.keys()}
         self._open = {
-            number: {pair: held for pair, held in pairs.items() if pair in self._scatter}
+            number: {pair: held for pair, held in pairs.items() if set(pair) <= self._fixes.keys()}
             for number, pairs in self._open.items()
         }
         self._hear(evidence)
@@ -232,11 +234,12 @@ class Baselines:
             self._fixes[evidence.agents[agent]].add(instant_s, place, rows["variance"][axes].astype(np.float64))
         for at in np.flatnonzero(rows["kind"] == Kind.RANGE):
             one, other = evidence.agents[rows["agent"][at]], evidence.agents[rows["other"][at]]
+            by = one
             arms = np.array([rows[axis][at] for axis in "xyz"])  # of the antennas, of the one's less the other's
             if one > other:
                 one, other, arms = other, one, -arms
             said = float(rows["value"][at]), float(rows["variance"][at])
-            self._waiting.append(_Waiting(float(t_s[at]), (one, other), *said, arms))
+            self._waiting.append(_Waiting(float(t_s[at]), (one, other), *said, arms, by))
 
     def _hold(self, now_s: float) -> None:
         """Hold the ranges that fixes surround against them."""
@@ -255,31 +258,37 @@ class Baselines:
                 held = self._open.setdefault(int(t_s // BIN_S), {}).setdefault(pair, [])
                 held.append((each.range_m - distance, apart, each.variance_m2))
                 between_m = each.range_m - float(apart @ each.arms_m) / distance
-                scatter = self._scatter.setdefault(pair, _Scatter())
+                to = pair[0] if each.measured_by == pair[1] else pair[1]
+                scatter = self._scatter.setdefault((each.measured_by, to), _Scatter())
                 scatter.hear(t_s, each.range_m, between_m, max(each.variance_m2**0.5, LEAST_SIGMA_M))
         self._waiting = still
 
     def _close(self, number: int) -> Bin:
-        pairs = {pair: _left_over(held, self._scatter[pair]) for pair, held in self._open.pop(number, {}).items()}
+        pairs = {pair: _left_over(held, self._scatters(pair)) for pair, held in self._open.pop(number, {}).items()}
         self._open = {each: held for each, held in self._open.items() if each > number}
         from_s = number * BIN_S
         variances = {agent: fixes.mean_variance(from_s, from_s + BIN_S) for agent, fixes in self._fixes.items()}
         return Bin(number, pairs, {agent: each for agent, each in variances.items() if each is not None})
 
+    def _scatters(self, pair: Pair) -> list[_Scatter]:
+        """Of those of its ends that measured."""
+        return [self._scatter[way] for way in (pair, pair[::-1]) if way in self._scatter]
 
-def _left_over(held: list[_Held], ranges: _Scatter) -> LeftOver:
+
+def _left_over(held: list[_Held], ranges: list[_Scatter]) -> LeftOver:
     residuals, ways, variances = zip(*held, strict=True)
     distances = np.linalg.norm(ways, axis=1)
     direction = np.mean(np.array(ways) / distances[:, None], axis=0)
     norm, distance = float(np.linalg.norm(direction)), float(np.mean(distances))
-    median, scatter = float(np.median(residuals)), ranges.sigmas()
+    median, scatter = float(np.median(residuals)), max(each.sigmas() for each in ranges)
+    stuck = any(each.stuck for each in ranges)
     disagreeing = (
         NORMAL_OF_MEDIAN * float(np.median(np.abs(np.subtract(residuals, median)))) if len(held) > 1 else LONE_M
     )
     spread = max(float(np.mean(variances)) * max(scatter, 1.0) ** 2, disagreeing**2)
     variance = np.pi / 2.0 * spread / len(held) + (CURVED_M2 / distance) ** 2
     unit = direction / norm if norm > 0.0 else direction
-    return LeftOver(median, unit, distance, scatter, ranges.stuck, variance)
+    return LeftOver(median, unit, distance, scatter, stuck, variance)
 
 
 def _fixes_of(rows: RowTable, t_s: Vector) -> Iterable[tuple[int, float, list[int]]]:

@@ -27,7 +27,7 @@ def survey(
     profiles: Profiles = None,
     overrides: Overrides = None,
 ) -> None:
-    """Write the [[anchors]] that the fixed [[targets]] of a flight turned out to be.
+    """Write the fixed [[targets]] of a flight as [[anchors]].
 
     Put them into the configuration of the next flight in place of those targets. Exit codes: 0 all fixed targets are
     known well enough, 1 some are left out.

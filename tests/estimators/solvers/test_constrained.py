@@ -181,14 +181,18 @@ def test_hard_box(seed: int, with_gains: bool) -> None:
 
 
 def test_box_and_noise_bounds_together() -> None:
-    problem = tightened(a_window(9), "corrected", 0.6)
-    free = solve_window(problem, BASE)
-    position = float(np.abs(free.path.reshape(-1, 2, 3))[:, 0].max()) - 0.02
-    settings = msgspec.structs.replace(SOFT, state_box_position_m=position)
-    limit = np.tile(np.repeat([position, np.inf], 3), 3)
-    solution = solve_window(problem, settings)
-    assert solution.status is Status.OK
-    assert check_conditions(problem, solution, settings, limit) > 1
+    active = []
+    for seed in range(8, 12):
+        problem = tightened(a_window(seed), "corrected", 0.6)
+        free = solve_window(problem, BASE)
+        position = float(np.abs(free.path.reshape(-1, 2, 3))[:, 0].max()) - 0.02
+        settings = msgspec.structs.replace(SOFT, state_box_position_m=position)
+        limit = np.tile(np.repeat([position, np.inf], 3), 3)
+        solution = solve_window(problem, settings)
+        assert solution.status is Status.OK
+        active.append(check_conditions(problem, solution, settings, limit))
+    assert min(active) > 0
+    assert max(active) > 1
 
 
 def test_agent_outside_the_rows_is_kept_in_the_box() -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ import pytest
 
 from estimators.settings import DEFAULTS_OF_KIND
 from fleetloc import cli
-from fleetloc.bench.awareness import CEILING_M, FOUND_M, SCENARIOS, AwarenessPlan, of_outages, of_target
+from fleetloc.bench.awareness import CEILING_M, FOUND_M, SCENARIOS, SETTLED_S, AwarenessPlan, of_outages, of_target
 from sim_bridge.studies.awareness import DRONES
 from sim_bridge.studies.awareness_flight import AwarenessFlight
 
@@ -54,7 +55,11 @@ def test_a_plan_keeps_what_its_kind_brings_along(test: str) -> None:
     assert settings.limits.target.ceiling_m == (None if plan.scenario().target is None else CEILING_M)
 
 
-def test_the_command_writes_a_row_for_each_estimator_and_number_of_rounds(tmp_path: Path) -> None:
+def test_the_command_writes_a_row_for_each_estimator_and_number_of_rounds(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # GIVEN half the flight: ten seconds after it is looked at
+    monkeypatch.setitem(SCENARIOS, "1", replace(SCENARIOS["1"], duration_s=SETTLED_S + 10.0))
     out = tmp_path / "figures.json"
     arguments = ["bench", "awareness", "--kinds", "consensus_mhe", "--rounds", "0,2", "--runs", "1", "--jobs", "1"]
     assert cli.main([*arguments, "--json", str(out)]) == 0

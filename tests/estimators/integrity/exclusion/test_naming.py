@@ -175,6 +175,22 @@ def test_a_drone_without_line_of_sight_is_named_by_its_ranges() -> None:
     assert when <= 3.0
 
 
+@pytest.mark.parametrize("seed", range(2))
+def test_ends_that_measure_the_same_pair_differently_are_no_scatter(seed: int) -> None:
+    # antennas have lobes: what one end of a pair measures may be off by a constant against what its other end does
+    monitor = NamingMonitor(1, PERIOD_S)
+    for tick, rows in rows_of_flight(5, seed, 15.0):
+        back = rows[rows["kind"] == Kind.RANGE]
+        back["agent"], back["other"] = back["other"].copy(), back["agent"].copy()
+        back["value"][between(back, 1, 3)] += 0.4
+        back["offset_s"] += 0.02
+        for axis in "xyz":
+            back[axis] *= -1.0
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), np.concatenate((rows, back))))
+        assert monitor.ranges_off == {}
+    assert monitor.named == {}
+
+
 def test_ranges_that_all_scatter_alike_are_used() -> None:
     # what they claim is wrong, not one of them
     rng = np.random.default_rng(1)

@@ -18,6 +18,17 @@ from estimators.model.measurements import Kind, RowTable
 from estimators.window.problem import WindowProblem
 
 Array = NDArray[np.float64]
+ANCHOR_RANGE, HEIGHT, ODOMETRY, POSITION, RANGE, RELATIVE, SPEED, VELOCITY = (
+    Kind.ANCHOR_RANGE,
+    Kind.HEIGHT,
+    Kind.ODOMETRY,
+    Kind.POSITION,
+    Kind.RANGE,
+    Kind.RELATIVE,
+    Kind.SPEED,
+    Kind.VELOCITY,
+)
+"""Looked up once: in an enumeration that costs more than what is done with a row."""
 
 
 def transition(agents: int, dt: float) -> Array:
@@ -42,20 +53,20 @@ def inputs(agents: int, dt: float) -> Array:
 def predicted_row(row: np.void, x: Array, eps: float) -> float:
     """h of one row at a fleet state."""
     a, o = int(row["agent"]), float(row["offset_s"])
-    direction = np.array([row["x"], row["y"], row["z"]])
+    kind, direction = int(row["kind"]), np.array([row["x"], row["y"], row["z"]])
     p, v = x[6 * a : 6 * a + 3], x[6 * a + 3 : 6 * a + 6]
-    if row["kind"] == Kind.POSITION:
+    if kind == POSITION:
         return float(direction @ (p + o * v))
-    if row["kind"] == Kind.HEIGHT:
+    if kind == HEIGHT:
         return float(p[2] + o * v[2])
-    if row["kind"] in (Kind.VELOCITY, Kind.ODOMETRY):
+    if kind in (VELOCITY, ODOMETRY):
         return float(direction @ v)
-    if row["kind"] == Kind.SPEED:
+    if kind == SPEED:
         return float(np.sqrt(v @ v + eps**2))
-    if row["kind"] == Kind.RELATIVE:
+    if kind == RELATIVE:
         b = int(row["other"])
         return float(direction @ (p + o * v - x[6 * b : 6 * b + 3] - o * x[6 * b + 3 : 6 * b + 6]))
-    if row["kind"] == Kind.RANGE:
+    if kind == RANGE:
         b = int(row["other"])
         away = p + o * v - x[6 * b : 6 * b + 3] - o * x[6 * b + 3 : 6 * b + 6]
     else:
@@ -74,21 +85,21 @@ def jacobian(rows: RowTable, x: Array, eps: float) -> Array:
     for r, row in enumerate(rows):
         a, o = int(row["agent"]), float(row["offset_s"])
         p, v = slice(6 * a, 6 * a + 3), slice(6 * a + 3, 6 * a + 6)
-        direction = np.array([row["x"], row["y"], row["z"]])
-        if row["kind"] in (Kind.VELOCITY, Kind.ODOMETRY):
+        kind, direction = int(row["kind"]), np.array([row["x"], row["y"], row["z"]])
+        if kind in (VELOCITY, ODOMETRY):
             out[r, v] = direction
-        elif row["kind"] == Kind.SPEED:
+        elif kind == SPEED:
             out[r, v] = x[v] / np.sqrt(x[v] @ x[v] + eps**2)
-        elif row["kind"] == Kind.POSITION:
+        elif kind == POSITION:
             out[r, p], out[r, v] = direction, o * direction
-        elif row["kind"] == Kind.HEIGHT:
+        elif kind == HEIGHT:
             down = np.array([0.0, 0.0, 1.0])
             out[r, p], out[r, v] = down, o * down
-        elif row["kind"] == Kind.ANCHOR_RANGE:
+        elif kind == ANCHOR_RANGE:
             away = x[p] + o * x[v] - direction
             unit = away / np.sqrt(away @ away + eps**2)
             out[r, p], out[r, v] = unit, o * unit
-        elif row["kind"] == Kind.RELATIVE:
+        elif kind == RELATIVE:
             b = int(row["other"])
             q, w = slice(6 * b, 6 * b + 3), slice(6 * b + 3, 6 * b + 6)
             out[r, p], out[r, v], out[r, q], out[r, w] = direction, o * direction, -direction, -o * direction

@@ -23,7 +23,7 @@ test: $(INSTALLED)
 	@# the kernels are compiled beside the check of types, so that tests do not wait for each other's
 	$(BIN)/fleetloc warmup -q & warmed=$$!; $(BIN)/mypy && wait $$warmed
 	$(BIN)/lint-imports
-	$(BIN)/pytest -n 2 --dist loadfile
+	$(BIN)/pytest -n 2
 
 demo: $(INSTALLED)
 	$(BIN)/fleetloc fleet configs/line3.toml --duration $(DEMO_SECONDS) --out $(DEMO_FOLDER)

@@ -7,7 +7,7 @@ holds are not in it.
 
 from __future__ import annotations
 
-from collections import Counter, deque
+from collections import Counter, defaultdict, deque
 
 import numpy as np
 
@@ -35,6 +35,8 @@ from transport.messages.measurement_body import (
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
 MIN_RANGES = 4
+MOST_KEPT = 4096
+"""Ranges kept of one body; the oldest go first."""
 CORRELATED = 4.0
 """On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
 
@@ -59,7 +61,10 @@ class RangeLocator:
 
     def __init__(self, config: FleetConfig, motions: Motions) -> None:
         self._period_s = config.fleet.period_s
-        self._ranges: deque[RangeMeasurement | AnchorRangeMeasurement] = deque(maxlen=4096)
+        self._ranges: defaultdict[int, deque[RangeMeasurement | AnchorRangeMeasurement]] = defaultdict(
+            lambda: deque(maxlen=MOST_KEPT)
+        )
+        """By the body at either end."""
         self._motions = motions
         self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
@@ -72,7 +77,9 @@ class RangeLocator:
     def note(self, record: Measurement) -> None:
         """Take in a record, own or heard."""
         if isinstance(record, RangeMeasurement | AnchorRangeMeasurement):
-            self._ranges.append(record)
+            self._ranges[record.observer].append(record)
+            if isinstance(record, RangeMeasurement):
+                self._ranges[record.other].append(record)
         elif isinstance(record, OrientationMeasurement):
             self._arms.note(record)
 
@@ -83,8 +90,9 @@ class RangeLocator:
         for old in [each for each in self._known if each < oldest]:
             del self._known[old]
         self._arms.forget(oldest)
-        while self._ranges and self._ranges[0].tick < oldest:
-            self._ranges.popleft()
+        for ranges in self._ranges.values():
+            while ranges and ranges[0].tick < oldest:
+                ranges.popleft()
 
     def place(self, agent_id: int, at_tick: int) -> Prior | None:
         """The prior of a drone at a tick from its ranges before that tick; ``None`` if they leave it open."""
@@ -106,7 +114,7 @@ class RangeLocator:
         """The prior of a target seen with its distance in one of the last ticks, from the latest of these."""
         sightings = [
             (record, place)
-            for record in self._ranges
+            for record in self._ranges[target_id]
             if isinstance(record, SightingMeasurement) and record.other == target_id and not record.is_bearing
             and until_tick - RANGE_MEMORY_TICKS <= record.tick < until_tick
             and (place := self._known.get(record.tick, {}).get(record.observer)) is not None
@@ -147,11 +155,10 @@ class RangeLocator:
         """At ``at_tick``, by the ranges before ``until_tick``."""
         usable = [
             (record, other, place)
-            for record in self._ranges
+            for record in self._ranges[agent_id]
             if record.tick < until_tick
             and not isinstance(record, SightingMeasurement)
-            and (other := _other_end(record, agent_id)) is not None
-            and (place := self._place_of(record, other)) is not None
+            and (place := self._place_of(record, other := _other_end(record, agent_id))) is not None
         ]
         usable.sort(key=lambda each: each[0].tick)
         usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
@@ -187,10 +194,8 @@ class RangeLocator:
         return self._known.get(record.tick, {}).get(record.other if other == record.other else record.observer)
 
 
-def _other_end(record: RangeMeasurement | AnchorRangeMeasurement, agent_id: int) -> int | Triple | None:
+def _other_end(record: RangeMeasurement | AnchorRangeMeasurement, agent_id: int) -> int | Triple:
     """The agent, or the place of the anchor, at the other end of a range of an agent."""
     if isinstance(record, AnchorRangeMeasurement):
-        return record.anchor_m if record.observer == agent_id else None
-    if record.observer == agent_id:
-        return record.other
-    return record.observer if record.other == agent_id else None
+        return record.anchor_m
+    return record.other if record.observer == agent_id else record.observer

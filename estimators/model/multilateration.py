@@ -12,19 +12,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from estimators.model.measurements import Matrix, Vector
+from estimators.model.multilateration_kernels import WEAK, descend
 
-ITERATIONS = 40
 DISTINCT_SIGMA = 4.0
 """Two minima this many sigma apart are two places."""
 RIVAL_COST = 18.0
 """A second place that explains the ranges with this much more cost or less is not ruled out (odds of 8000)."""
 MAX_COST_RATIO = 9.0
 """Cost per surplus range above which no place explains the ranges."""
-_WEAK = 1e-8
-"""Position information (1/m2) added so that a covariance exists: a sigma of 10 km."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -124,48 +121,18 @@ def _mirrored(states: Matrix, anchors: Matrix) -> Matrix:
     return out
 
 
-def _residuals(states: Matrix, ranges: RangeSet) -> tuple[Matrix, NDArray[np.float64]]:
-    """Whitened residuals ``(s, m)`` of states ``(s, 6)`` and their derivatives ``(s, m, 6)``."""
-    there = states[:, None, :3] + ranges.lead_s[:, None] * states[:, None, 3:] + ranges.moved_m
-    away = there - ranges.anchor_m
-    distance = np.sqrt(np.sum(away**2, axis=2) + 1e-12)
-    unit = away / distance[..., None]
-    root = np.sqrt(ranges.variance_m2)
-    jacobian = np.concatenate((unit, ranges.lead_s[:, None] * unit), axis=2) / root[:, None]
-    return (distance - ranges.range_m) / root, jacobian
-
-
-def _cost(states: Matrix, ranges: RangeSet, speed_sigma_mps: float) -> Vector:
-    residuals, _ = _residuals(states, ranges)
-    return np.asarray(np.sum(residuals**2, axis=1) + np.sum(states[:, 3:] ** 2, axis=1) / speed_sigma_mps**2)
-
-
 def _information(state: Vector, ranges: RangeSet, speed_sigma_mps: float) -> Matrix:
-    _, jacobian = _residuals(state[None], ranges)
-    prior = np.diag([_WEAK] * 3 + [1.0 / speed_sigma_mps**2] * 3)
-    return np.asarray(jacobian[0].T @ jacobian[0] + prior)
+    """Of the ranges at a state, ``(6, 6)``, with that of the prior on the velocity."""
+    away = state[:3] + ranges.lead_s[:, None] * state[3:] + ranges.moved_m - ranges.anchor_m
+    unit = away / np.sqrt(np.sum(away**2, axis=1) + 1e-12)[:, None]
+    jacobian = np.concatenate((unit, ranges.lead_s[:, None] * unit), axis=1) / np.sqrt(ranges.variance_m2)[:, None]
+    prior = np.diag([WEAK] * 3 + [1.0 / speed_sigma_mps**2] * 3)
+    return np.asarray(jacobian.T @ jacobian + prior)
 
 
 def _descend(states: Matrix, ranges: RangeSet, speed_sigma_mps: float) -> tuple[Matrix, Vector]:
-    """Levenberg-Marquardt from all starts ``(s, 6)`` at once; where they end and at which cost ``(s,)``."""
-    prior = np.diag([_WEAK] * 3 + [1.0 / speed_sigma_mps**2] * 3)
-    states, costs = states.copy(), _cost(states, ranges, speed_sigma_mps)
-    damping: Vector = np.full(len(states), 1e-3)
-    for _ in range(ITERATIONS):
-        residuals, jacobian = _residuals(states, ranges)
-        hessian = np.einsum("smi,smj->sij", jacobian, jacobian) + prior
-        gradient = np.einsum("smi,sm->si", jacobian, residuals)
-        gradient[:, 3:] += states[:, 3:] / speed_sigma_mps**2
-        scale = np.einsum("sii->si", hessian)
-        damped = hessian + damping[:, None, None] * scale[:, :, None] * np.eye(6)
-        step = np.linalg.solve(damped, gradient[..., None])[..., 0]
-        tried = states - step
-        tried_costs = _cost(tried, ranges, speed_sigma_mps)
-        better = tried_costs < costs
-        states = np.where(better[:, None], tried, states)
-        gain = np.where(better, costs - tried_costs, 0.0)
-        costs = np.where(better, tried_costs, costs)
-        damping = np.clip(np.where(better, damping / 5.0, damping * 4.0), 1e-9, 1e9)
-        if better.any() and gain.max() < 1e-6:
-            break
-    return states, costs
+    """Where the descents from all starts ``(s, 6)`` end, and at which cost ``(s,)``."""
+    reached = np.ascontiguousarray(states, dtype=float).copy()
+    table = np.column_stack((ranges.lead_s, ranges.range_m, 1.0 / np.sqrt(ranges.variance_m2)))
+    ends = np.ascontiguousarray(ranges.anchor_m - ranges.moved_m, dtype=float)
+    return reached, descend(reached, ends, np.ascontiguousarray(table), speed_sigma_mps)

@@ -23,7 +23,8 @@ test: $(INSTALLED)
 	@# the kernels are compiled beside the check of types, so that tests do not wait for each other's
 	$(BIN)/fleetloc warmup -q & warmed=$$!; $(BIN)/mypy && wait $$warmed
 	$(BIN)/lint-imports
-	$(BIN)/pytest -n 2
+	@# neighbouring tests stay with one worker: what a file flies once is flown once, and live fleets follow each other
+	$(BIN)/pytest -n 2 --dist worksteal
 
 demo: $(INSTALLED)
 	$(BIN)/fleetloc fleet configs/line3.toml --duration $(DEMO_SECONDS) --out $(DEMO_FOLDER)

@@ -33,8 +33,9 @@ CURVED_M2 = 1.2
 over d, which no direction tells."""
 NORMAL_OF_MEDIAN = 1.4826
 """1-sigma of a Gaussian by the median of its absolute value."""
-LONE_M = 0.5
-"""1-sigma of a range that is alone in its bin, so that nothing tells whether it had a line of sight."""
+LONE_M, LONE_SIGMAS = 0.5, 4.0
+"""1-sigma at least, and the most that it may be off by, of a range that is alone in its bin: nothing tells whether it
+had a line of sight, so that it takes several of them to say that anything is off."""
 SCATTER_RANGES = 24
 """So many of a pair tell how they scatter, by how each is off the line between those before and after it."""
 LEAST_SHARE, NORMAL_OF_LEAST = 0.2, 3.947
@@ -282,9 +283,9 @@ def _left_over(held: list[_Held], ranges: list[_Scatter]) -> LeftOver:
     norm, distance = float(np.linalg.norm(direction)), float(np.mean(distances))
     median, scatter = float(np.median(residuals)), max(each.sigmas() for each in ranges)
     stuck = any(each.stuck for each in ranges)
-    disagreeing = (
-        NORMAL_OF_MEDIAN * float(np.median(np.abs(np.subtract(residuals, median)))) if len(held) > 1 else LONE_M
-    )
+    disagreeing = NORMAL_OF_MEDIAN * float(np.median(np.abs(np.subtract(residuals, median))))
+    if len(held) == 1:
+        disagreeing = max(LONE_M, abs(median) / LONE_SIGMAS)
     spread = max(float(np.mean(variances)) * max(scatter, 1.0) ** 2, disagreeing**2)
     variance = np.pi / 2.0 * spread / len(held) + (CURVED_M2 / distance) ** 2
     unit = direction / norm if norm > 0.0 else direction

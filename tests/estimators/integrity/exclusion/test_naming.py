@@ -139,6 +139,42 @@ def test_a_pair_whose_ranges_are_off_is_named_and_no_receiver_and_taken_back() -
     assert 10.0 <= taken_back[0] - 5.0 <= 13.0
 
 
+def seldom(
+    seed: int, duration_s: float, shift: Shift = no_shift, off_m: float = 0.0
+) -> list[tuple[float, set[int], set[Pair]]]:
+    """Each change of whose fixes and ranges are off, where a pair has three ranges a second, few in a bin.
+
+    One in twenty has no line of sight, one in a hundred is a spike; those between 2 and 4 are ``off_m`` from 20 s on.
+    """
+    monitor, rng = NamingMonitor(1, PERIOD_S), np.random.default_rng([seed, 5])
+    changes = [(0.0, set[int](), set[Pair]())]
+    for tick, rows in rows_of_flight(5, seed, duration_s, shift):
+        ranges, chance = rows["kind"] == Kind.RANGE, rng.random(len(rows))
+        rows["value"] += np.where(ranges & (chance < 0.05), rng.exponential(1.0, len(rows)), 0.0)
+        rows["value"] += np.where(ranges & (chance > 0.99), rng.uniform(5.0, 19.0, len(rows)), 0.0)
+        rows["value"][between(rows, 1, 3)] += off_m * (tick >= 200)
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows[~ranges | (tick % 3 == 0)]))
+        now = set(monitor.named), set(monitor.ranges_off)
+        if now != changes[-1][1:]:
+            changes.append((tick * PERIOD_S, *now))
+    return changes[1:]
+
+
+def test_spikes_of_ranges_that_are_alone_in_their_bin_accuse_nobody() -> None:
+    for seed in range(2):
+        assert seldom(seed, 40.0) == []
+
+
+def test_ranges_that_come_seldom_tell_a_jump_and_a_pair_that_is_off() -> None:
+    for seed in range(2):
+        ((when_s, named, ranges_off), *_) = seldom(seed, 24.0, jump(2, np.array([30.0, 0.0, 0.0]), 20.0, 99.0))
+        assert (named, ranges_off) == ({3}, set())
+        assert when_s <= 22.0
+        ((when_s, named, ranges_off), *_) = seldom(seed, 24.0, off_m=8.0)
+        assert (named, ranges_off) == (set(), {(2, 4)})
+        assert when_s <= 23.0
+
+
 def test_ranges_that_are_stuck_are_named() -> None:
     held: list[float] = []
 

@@ -33,6 +33,10 @@ CURVED_M2 = 1.2
 over d, which no direction tells."""
 NORMAL_OF_MEDIAN = 1.4826
 """1-sigma of a Gaussian by the median of its absolute value."""
+BLOCKED_SCATTER_M = 1.0
+"""By how much those without a line of sight scatter."""
+SCATTER_NATS = 2.0
+"""What the scatter of a bin, a few ranges, tells at most."""
 LONE_M, LONE_SIGMAS = 0.5, 4.0
 """1-sigma at least, and the most that it may be off by, of a range that is alone in its bin: nothing tells whether it
 had a line of sight, so that it takes several of them to say that anything is off."""
@@ -50,6 +54,10 @@ PASSING_MPS = 8.0
 """Drones that pass each other so fast have ranges that are off a line, the more the nearer they are."""
 LEAST_SIGMA_M = 0.05
 """No ranges are taken to be better than that."""
+ENDS_RANGES = 16
+"""So many of one end held against those of the other tell whether both measure the same distance."""
+LEAST_LOBE_M = 1.0 / 6.0
+"""Antennas have lobes, and modules delays: both ends of a sound pair may differ by several times that."""
 
 Pair = tuple[int, int]
 """Two ids, the smaller first."""
@@ -67,6 +75,22 @@ class SharedTick:
 
 
 @dataclass(frozen=True, slots=True)
+class Ranging:
+    """What a pair's ranges of late say of themselves, whatever any fix says."""
+
+    scatter: float
+    """About a straight line, over the sigma that they claim."""
+    ends_apart: float
+    """How far what one end measures is off what the other does, over the same: no receiver makes them differ."""
+    stuck: bool
+    """Whether they repeat to the last digit."""
+
+    def is_spoiled(self, limit: float) -> bool:
+        """Whether they are off, with that many sigmas as the limit."""
+        return self.stuck or max(self.scatter, self.ends_apart) > limit
+
+
+@dataclass(frozen=True, slots=True)
 class LeftOver:
     """Of one pair in one bin."""
 
@@ -76,10 +100,9 @@ class LeftOver:
     """``(3,)`` from the second to the first, by their fixes."""
     distance_m: float
     """Between their fixes, on average."""
-    scatter: float
-    """Of the ranges of late about a straight line, over the sigma that they claim."""
-    stuck: bool
-    """Whether the ranges repeat to the last digit."""
+    ranging: Ranging
+    blocked_nats: float
+    """Odds of ranges without a line of sight, each too long by something else, by how those of the bin scatter."""
     variance_m2: float
     """Of that median, as far as ranges and the curvature of the distance go."""
 
@@ -92,6 +115,8 @@ class Bin:
     pairs: Mapping[Pair, LeftOver]
     fix_variance_m2: Mapping[int, Vector]
     """``(3,)`` of the mean of a drone's fixes, as claimed."""
+    unheld: Mapping[Pair, Ranging]
+    """Of pairs that range, and of which an end has had no fixes for a while, so that nothing can be left over."""
 
     def without(self, agents: Container[int]) -> Bin:
         """The same without the pairs of some drones."""
@@ -175,10 +200,10 @@ class _Scatter:
         """Whether the last so many were the same."""
         return self._repeats >= STUCK_RANGES
 
-    def hear(self, t_s: float, said_m: float, range_m: float, sigma_m: float) -> None:
-        """The next range, as said and between the bodies; one that is late is left out."""
+    def hear(self, t_s: float, said_m: float, range_m: float, sigma_m: float) -> bool:
+        """The next range, as said and between the bodies; false for one that is late, which is left out."""
         if self._last and t_s <= self._last[-1][0]:
-            return
+            return False
         self._repeats = self._repeats + 1 if said_m == self._said_m else 0
         self._said_m = said_m
         self._last.append((t_s, range_m))
@@ -188,11 +213,51 @@ class _Scatter:
             off = middle - (1.0 - share) * before - share * after
             curved_m = 0.5 * (t1 - t0) * (t2 - t1) * PASSING_MPS**2 / max(range_m, 1.0)
             self._off.append(abs(off) / (sigma_m * (1.0 + (1.0 - share) ** 2 + share**2) ** 0.5 + curved_m))
+        return True
 
     def sigmas(self) -> float:
         """1-sigma over what is claimed; 1 where it is not told."""
         enough = len(self._off) >= FEWEST_RANGES
         return NORMAL_OF_LEAST * float(np.quantile(self._off, LEAST_SHARE)) if enough else 1.0
+
+
+class _Ends:
+    """Of a pair's ranges that both ends measured, each held against the line between two of the other end."""
+
+    def __init__(self) -> None:
+        self._heard: dict[int, deque[tuple[float, float]]] = {}
+        self._apart: deque[tuple[float, float]] = deque(maxlen=ENDS_RANGES)
+
+    def hear(self, t_s: float, by: int, pair: Pair, range_m: float, sigma_m: float) -> None:
+        """The next range that one end measured, between the bodies."""
+        mine = self._heard.setdefault(by, deque(maxlen=ENDS_RANGES))
+        other = self._heard.setdefault(pair[0] if by == pair[1] else pair[1], deque(maxlen=ENDS_RANGES))
+        sign, unit_m = (1.0 if by == pair[0] else -1.0), max(sigma_m, LEAST_LOBE_M)
+        if mine:
+            of_late = [each for each in other if mine[-1][0] < each[0] <= t_s]
+            found = [(at, _off_line((at, heard), mine[-1], (t_s, range_m))) for at, heard in of_late]
+            self._apart.extend((at, -sign * off / unit_m) for at, off in found if off is not None)
+        later = len(other)
+        while later and other[later - 1][0] >= t_s:
+            later -= 1
+        if 0 < later < len(other):
+            off = _off_line((t_s, range_m), other[later - 1], other[later])
+            self._apart.extend([] if off is None else [(t_s, sign * off / unit_m)])
+        mine.append((t_s, range_m))
+
+    def apart(self, now_s: float) -> float:
+        """By how many sigmas they differ in the middle; 0 where it is not told."""
+        fresh = [off for t_s, off in self._apart if now_s - t_s <= 2.0 * WAIT_S]
+        return abs(float(np.median(fresh))) if len(fresh) == ENDS_RANGES else 0.0
+
+
+def _off_line(at: tuple[float, float], before: tuple[float, float], after: tuple[float, float]) -> float | None:
+    """How far a range is off the line between two; ``None`` where they are too far apart for it to be straight."""
+    gap_s = after[0] - before[0]
+    if not 0.0 < gap_s <= STRAIGHT_S:
+        return None
+    share = (at[0] - before[0]) / gap_s
+    return at[1] - (1.0 - share) * before[1] - share * after[1]
 
 
 class Baselines:
@@ -205,12 +270,17 @@ class Baselines:
         self._open: dict[int, dict[Pair, list[_Held]]] = {}
         self._scatter: dict[tuple[int, int], _Scatter] = {}
         """Of who measured, and to whom."""
+        self._ends: dict[Pair, _Ends] = {}
+        self._unheld: dict[Pair, int] = {}
+        """The bin of the last range that there was no fix to be held against for."""
         self._next: int | None = None
 
     def take(self, evidence: SharedTick) -> list[Bin]:
         """The bins that a tick closes."""
         self._fixes = {agent: self._fixes.get(agent) or _Fixes() for agent in evidence.agents}
         self._scatter = {pair: each for pair, each in self._scatter.items() if set(pair) <= self._fixes.keys()}
+        self._ends = {pair: each for pair, each in self._ends.items() if set(pair) <= self._fixes.keys()}
+        self._unheld = {pair: each for pair, each in self._unheld.items() if set(pair) <= self._fixes.keys()}
         self._open = {
             number: {pair: held for pair, held in pairs.items() if set(pair) <= self._fixes.keys()}
             for number, pairs in self._open.items()
@@ -247,7 +317,13 @@ class Baselines:
         still: deque[_Waiting] = deque()
         for each in self._waiting:
             t_s, pair = each.t_s, each.pair
-            if not -WAIT_S <= now_s - t_s <= WAIT_S or not all(agent in self._fixes for agent in pair):
+            if not all(agent in self._fixes for agent in pair):
+                continue
+            if not -WAIT_S <= now_s - t_s <= WAIT_S:
+                if now_s > t_s:
+                    self._unheld[pair] = max(int(t_s // BIN_S), self._unheld.get(pair, 0))
+                    # which way the antennas' lever arms point is not known: they may be all of what it is off
+                    self._hear_ranging(each, each.range_m, float(np.linalg.norm(each.arms_m)))
                 continue
             one, other = (self._fixes[agent].at(t_s) for agent in pair)
             if one is None or other is None:
@@ -258,38 +334,56 @@ class Baselines:
             if min(distance, each.range_m) > NEAREST_M and max(distance, each.range_m) < FARTHEST_M:
                 held = self._open.setdefault(int(t_s // BIN_S), {}).setdefault(pair, [])
                 held.append((each.range_m - distance, apart, each.variance_m2))
-                between_m = each.range_m - float(apart @ each.arms_m) / distance
-                to = pair[0] if each.measured_by == pair[1] else pair[1]
-                scatter = self._scatter.setdefault((each.measured_by, to), _Scatter())
-                scatter.hear(t_s, each.range_m, between_m, max(each.variance_m2**0.5, LEAST_SIGMA_M))
+                self._hear_ranging(each, each.range_m - float(apart @ each.arms_m) / distance)
         self._waiting = still
 
+    def _hear_ranging(self, each: _Waiting, between_m: float, arm_m: float = 0.0) -> None:
+        """A range for what the pair's ranges say of themselves, between the bodies as well as that is known."""
+        pair, by, sigma_m = each.pair, each.measured_by, max(math.hypot(each.variance_m2**0.5, arm_m), LEAST_SIGMA_M)
+        to = pair[0] if by == pair[1] else pair[1]
+        if self._scatter.setdefault((by, to), _Scatter()).hear(each.t_s, each.range_m, between_m, sigma_m):
+            self._ends.setdefault(pair, _Ends()).hear(each.t_s, by, pair, between_m, sigma_m)
+
     def _close(self, number: int) -> Bin:
-        pairs = {pair: _left_over(held, self._scatters(pair)) for pair, held in self._open.pop(number, {}).items()}
-        self._open = {each: held for each, held in self._open.items() if each > number}
         from_s = number * BIN_S
+        held = self._open.pop(number, {})
+        pairs = {pair: _left_over(each, self._ranging(pair, from_s)) for pair, each in held.items()}
+        self._open = {each: held for each, held in self._open.items() if each > number}
         variances = {agent: fixes.mean_variance(from_s, from_s + BIN_S) for agent, fixes in self._fixes.items()}
-        return Bin(number, pairs, {agent: each for agent, each in variances.items() if each is not None})
+        late = number - round((WAIT_S + LATE_S + 1.0) / BIN_S)
+        unheld = [pair for pair, last in self._unheld.items() if last >= late and pair not in pairs]
+        known = {agent: each for agent, each in variances.items() if each is not None}
+        return Bin(number, pairs, known, {pair: self._ranging(pair, from_s) for pair in unheld})
 
-    def _scatters(self, pair: Pair) -> list[_Scatter]:
+    def _ranging(self, pair: Pair, now_s: float) -> Ranging:
         """Of those of its ends that measured."""
-        return [self._scatter[way] for way in (pair, pair[::-1]) if way in self._scatter]
+        ways = [self._scatter[way] for way in (pair, pair[::-1]) if way in self._scatter]
+        apart = self._ends[pair].apart(now_s) if pair in self._ends else 0.0
+        return Ranging(max(each.sigmas() for each in ways), apart, any(each.stuck for each in ways))
 
 
-def _left_over(held: list[_Held], ranges: list[_Scatter]) -> LeftOver:
+def _left_over(held: list[_Held], ranging: Ranging) -> LeftOver:
     residuals, ways, variances = zip(*held, strict=True)
     distances = np.linalg.norm(ways, axis=1)
     direction = np.mean(np.array(ways) / distances[:, None], axis=0)
     norm, distance = float(np.linalg.norm(direction)), float(np.mean(distances))
-    median, scatter = float(np.median(residuals)), max(each.sigmas() for each in ranges)
-    stuck = any(each.stuck for each in ranges)
+    median = float(np.median(residuals))
     disagreeing = NORMAL_OF_MEDIAN * float(np.median(np.abs(np.subtract(residuals, median))))
     if len(held) == 1:
         disagreeing = max(LONE_M, abs(median) / LONE_SIGMAS)
-    spread = max(float(np.mean(variances)) * max(scatter, 1.0) ** 2, disagreeing**2)
+    spread = max(float(np.mean(variances)) * max(ranging.scatter, 1.0) ** 2, disagreeing**2)
     variance = np.pi / 2.0 * spread / len(held) + (CURVED_M2 / distance) ** 2
+    nats = 0.0 if len(held) == 1 else _blocked_nats(disagreeing, max(float(np.mean(variances)) ** 0.5, LEAST_SIGMA_M))
     unit = direction / norm if norm > 0.0 else direction
-    return LeftOver(median, unit, distance, scatter, stuck, variance)
+    return LeftOver(median, unit, distance, ranging, nats, variance)
+
+
+def _blocked_nats(scatter_m: float, sigma_m: float) -> float:
+    """Odds of an exponential scatter against that of what ranges claim, with as much for their ends and motion."""
+    sigma_m = math.hypot(sigma_m, LEAST_LOBE_M)
+    blocked = -scatter_m / BLOCKED_SCATTER_M - math.log(BLOCKED_SCATTER_M)
+    sound = -0.5 * (scatter_m / sigma_m) ** 2 - math.log(sigma_m * math.sqrt(np.pi / 2.0))
+    return min(max(blocked - sound, -SCATTER_NATS), SCATTER_NATS)
 
 
 def _fixes_of(rows: RowTable, t_s: Vector) -> Iterable[tuple[int, float, list[int]]]:

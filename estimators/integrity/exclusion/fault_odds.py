@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from itertools import combinations
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,8 +45,6 @@ OLDEST_RANGES_BINS = 64
 """Ranges go wrong at once: no long memory is needed."""
 RANGES_PAY_NATS = 2.0
 """What each of them pays for that there are more ways for ranges to be off than for receivers."""
-SWAPPED_PAY_NATS = 5.0
-"""What two that are swapped pay, which happens seldom, and which a receiver that is dragged away may look like."""
 STEP, RAMP = 0, 1
 
 
@@ -91,7 +88,7 @@ class Odds:
 
     receivers: dict[int, LikelyFault]
     ranges: dict[tuple[Pair, ...], LikelyFault]
-    """Of one pair; of two pairs of one drone that are swapped; and of all of a drone, alike."""
+    """Of one pair; of two pairs of one drone that are swapped (`swaps`); and of all of a drone, alike."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -238,25 +235,22 @@ class FaultOdds:
         return Odds({slow.agents[at]: each for at, each in receivers}, self._of_ranges(number, slow, fresh))
 
     def _of_ranges(self, number: int, slow: SlowErrors, fresh: Fresh) -> dict[tuple[Pair, ...], LikelyFault]:
-        """Of each pair, of two that are swapped, and of all of a drone alike."""
-        count = len(slow.agents) - 1
-        each = np.eye(count)
-        swapped = np.array([each[one] - each[other] for one, other in combinations(range(count), 2)]).reshape(
-            -1, count
-        )
-        steps, whole = self._ranges.sizes[:1], self._ranges.sizes
+        """Of each pair, and of all of a drone alike.
+
+        These are too long, and at once: nothing makes them all shorter, or ever longer, as a receiver does that is
+        dragged away from the others or towards them.
+        """
+        count, sizes, least_nats = len(slow.agents) - 1, self._ranges.sizes, self._least_nats + RANGES_PAY_NATS
+        each = self._ranges.likely_along(number, sizes, np.eye(count), least_nats)
+        alike = self._ranges.likely_along(number, sizes[:1], np.ones((1, count)), least_nats)
+        too_long = {key: fault for key, fault in alike.items() if fault.shift_m[0] > 0.0}
         found: dict[tuple[Pair, ...], LikelyFault] = {}
-        for ways, sizes, pay_nats in (
-            (each, whole, RANGES_PAY_NATS),
-            (swapped, steps, SWAPPED_PAY_NATS),
-            (np.ones((1, count)), whole, RANGES_PAY_NATS),
-        ):
-            likely = self._ranges.likely_along(number, sizes, ways, self._least_nats + pay_nats)
+        for ways, likely in ((np.eye(count), each), (np.ones((1, count)), too_long)):
             for (at, way), fault in likely.items():
                 of_agent = zip(_pairs_of(slow.agents[at], slow), ways[way], strict=True)
                 pairs = tuple(pair for pair, part in of_agent if part)
                 if set(pairs) <= set(fresh.pairs):
-                    found[pairs] = replace(fault, nats=fault.nats - pay_nats)
+                    found[pairs] = replace(fault, nats=fault.nats - RANGES_PAY_NATS)
         return found
 
 

@@ -14,10 +14,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from estimators.integrity.exclusion.baselines import BIN_S, Baselines, Bin, Pair, SharedTick
+from estimators.integrity.exclusion.baselines import BIN_S, Baselines, Bin, Pair, Ranging, SharedTick
 from estimators.integrity.exclusion.fault_odds import RANGES_STEP_M, STEP_M, FaultOdds, LikelyFault, Odds
 from estimators.integrity.exclusion.jumps import JUMPED_SQUARE, jump
 from estimators.integrity.exclusion.slow_errors import Fresh, SlowErrors
+from estimators.integrity.exclusion.spoiled_ranges import SpoiledRanges
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.thresholds import (
     AGREEING_NATS,
@@ -39,9 +40,8 @@ BINS_KEPT = 40
 """Of a fault that is so young all is begun again from before it, without whom it is of."""
 BINS_BEFORE = 4
 """So many before its likeliest begin."""
-
-Whose = int | Pair
-"""A drone, of its receiver; or a pair, of its ranges."""
+BINS_JUDGED = 12
+"""The last of them tell of the others again: two may have gone wrong at once."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +63,7 @@ class NamingMonitor:
         self._baselines = Baselines(period_s)
         self._slow = SlowErrors()
         self._odds = FaultOdds(AGREEING_NATS)
+        self._spoiled = SpoiledRanges()
         self._before: deque[tuple[Bin, Vector, Matrix]] = deque(maxlen=BINS_KEPT)
         """The last bins, and what was known before each."""
         self._jumped_nats: dict[int, float] = {}
@@ -100,7 +101,7 @@ class NamingMonitor:
 
     def _keep(self, agents: tuple[int, ...]) -> None:
         self._slow.keep(agents)
-        self._odds.restart(self._slow)
+        self._restart_odds()
         self._before.clear()
         self.named = {agent: each for agent, each in self.named.items() if agent in agents}
         self.ranges_off = {pair: each for pair, each in self.ranges_off.items() if set(pair) <= set(agents)}
@@ -112,8 +113,7 @@ class NamingMonitor:
         there = [pair for pair in closed.pairs if all(agent in closed.fix_variance_m2 for agent in pair)]
         chosen = self._chosen(closed)
         if chosen:
-            fresh = self._slow.fresh(closed, chosen)
-            now = self._odds.take(closed.number, self._slow, fresh, self._slow.take(fresh))
+            fresh, now = self._learn(closed, chosen)
             self.receivers = len({agent for pair in chosen for agent in pair})
             self._note_jumps(fresh, now)
             self.separation_m = self._separation(now)
@@ -122,23 +122,48 @@ class NamingMonitor:
             mine = sorted(pair for pair in there if agent in pair and not self._is_doubted(pair, but=agent))
             self._reconsider_receiver(agent, closed, mine)
         for pair in list(self.ranges_off):
-            if pair in there and not self._is_doubted(pair, but=pair):
+            if pair in there and not any(agent in self.named for agent in pair):
                 self._reconsider_ranges(pair, closed)
+            elif pair in closed.pairs:
+                self._reconsider_unheld(pair, closed.pairs[pair].ranging)
+            elif pair in closed.unheld:
+                self._reconsider_unheld(pair, closed.unheld[pair])
+
+    def _learn(self, made: Bin, chosen: list[Pair]) -> tuple[Fresh, Odds]:
+        """What is new in a bin, learnt from, and the odds of faults after it."""
+        fresh = self._slow.fresh(made, chosen)
+        spoiled = self._spoiled.take(fresh, AGREEING_NATS)
+        # nothing is learnt from ranges that look spoiled: it would hide that they are
+        speaks = self._spoiled.speaks_nats > AGREEING_NATS
+        gain = np.zeros_like(fresh.rows.T) if speaks else self._slow.take(fresh)
+        now = self._odds.take(made.number, self._slow, fresh, gain)
+        for pairs, fault in spoiled.items():
+            if pairs not in now.ranges or now.ranges[pairs].nats < fault.nats:
+                now.ranges[pairs] = fault
+        return fresh, now
 
     def _find_spoiled(self, closed: Bin, tick: int) -> None:
-        """Ranges that repeat, or scatter as without a line of sight, are off, whatever their mean is.
+        """Ranges that repeat, scatter as without a line of sight, or differ by end are off, whatever their mean is.
 
-        Where nearly all scatter it is what they claim that is wrong.
+        Where nearly all scatter it is what they claim that is wrong. What stands before half of a drone's neighbours
+        stands before the others, too: for them less is enough.
         """
-        usual = max(float(np.quantile([each.scatter for each in closed.pairs.values()] or [1.0], 0.25)), 1.0)
-        known = closed.pairs.items()
-        found = {pair: each for pair, each in known if each.stuck or each.scatter > SCATTERED * usual}
-        fresh = {pair: each for pair, each in found.items() if not self._is_doubted(pair)}
-        for pair, each in fresh.items():
+        scatters = [each.ranging.scatter for each in closed.pairs.values()]
+        usual = max(float(np.quantile(scatters or [1.0], 0.25)), 1.0)
+        known = [(pair, each) for pair, each in closed.pairs.items() if not self._is_doubted(pair)]
+        hidden = {agent for agent in self._slow.agents if self._is_hidden(agent, closed)}
+        limits = {pair: usual * (AGREEING_SCATTER if hidden & set(pair) else SCATTERED) for pair, _ in known}
+        found = {pair: each for pair, each in known if each.ranging.is_spoiled(limits[pair])}
+        for pair, each in found.items():
             self.ranges_off[pair] = Named(tick, NAMED_NATS, np.array([each.residual_m]))
-        if fresh:
-            self._begin_again(SCATTERED_S)
-            self._odds.restart(self._slow)
+        if found and not self._begin_again(SCATTERED_S, but_last=True):
+            self._restart_odds()
+
+    def _is_hidden(self, agent: int, closed: Bin) -> bool:
+        """Whether the ranges to half of a drone's neighbours are off, and to more than one."""
+        of_agent = [pair for pair in closed.pairs if agent in pair]
+        off = sum(pair in self.ranges_off for pair in of_agent)
+        return off >= max(2.0, 0.5 * len(of_agent))
 
     def _note_jumps(self, fresh: Fresh, now: Odds) -> None:
         """While what is new is so large: the odds of jumps, of all such bins in a row, where they are better."""
@@ -153,21 +178,24 @@ class NamingMonitor:
             if agent not in now.receivers or now.receivers[agent].nats < nats:
                 now.receivers[agent] = replace(found, nats=nats)
 
+    def _restart_odds(self) -> None:
+        self._odds.restart(self._slow)
+        self._spoiled.restart()
+
     def _pass_by(self, number: int) -> None:
         passed = 1 if self._last is None else number - self._last
         if not 0 < passed <= LONGEST_GAP_BINS:
             self._slow.forget(range(len(self._slow.state)))
-            self._odds.restart(self._slow)
+            self._restart_odds()
             self._before.clear()
         else:
             self._slow.pass_by(passed)
             self._odds.pass_by(self._slow, passed)
         self._last = number
 
-    def _is_doubted(self, pair: Pair, but: Whose | None = None) -> bool:
-        """Whether what is left over of a pair is of somebody who is off, besides one."""
-        off: list[Whose] = [*self.named, *self.ranges_off]
-        return any(_is_of(pair, whose) for whose in off if whose != but)
+    def _is_doubted(self, pair: Pair, but: int | None = None) -> bool:
+        """Whether what is left over of a pair is of ranges that are off, or of a receiver besides one."""
+        return pair in self.ranges_off or any(agent in self.named for agent in pair if agent != but)
 
     def _judge(self, now: Odds, tick: int) -> None:
         self.unattributable_nats = 0.0
@@ -197,26 +225,33 @@ class NamingMonitor:
         self._unlearn(fault)
         if isinstance(whose, int):
             self._slow.forget(self._slow.of_agent(whose))
-        self._odds.restart(self._slow)
 
     def _unlearn(self, fault: LikelyFault) -> None:
         """What a fault has taught: begin again from before it; of an old one, which is small, take out its effect."""
         if not self._begin_again(fault.age_s):
             self._slow.correct(fault.effect, fault.error, fault.covariance)
+            self._restart_odds()
 
-    def _begin_again(self, age_s: float) -> bool:
-        """Learn again from what was a while ago on, without who is off; false where that is not kept."""
+    def _begin_again(self, age_s: float, *, but_last: bool = False) -> bool:
+        """Learn again from what was a while ago on, without who is off; false where that is not kept.
+
+        ``but_last``: the last bin has not been learnt from yet.
+        """
         back = round(age_s / BIN_S) + BINS_BEFORE
         if back > len(self._before):
             return False
         again = list(self._before)[-back:]
         _, self._slow.state, self._slow.covariance = again[0]
+        self._restart_odds()
         for at, (made, _, _) in enumerate(again):
-            if at:
-                self._slow.pass_by(made.number - again[at - 1][0].number)
-            chosen = self._chosen(made)
-            if chosen:
+            passed = made.number - again[at - 1][0].number if at else 0
+            self._slow.pass_by(passed)
+            self._odds.pass_by(self._slow, passed)
+            chosen = [] if but_last and at == len(again) - 1 else self._chosen(made)
+            if chosen and len(again) - at > BINS_JUDGED:
                 self._slow.take(self._slow.fresh(made, chosen))
+            elif chosen:
+                self._learn(made, chosen)
         return True
 
     def _chosen(self, made: Bin) -> list[Pair]:
@@ -254,16 +289,22 @@ class NamingMonitor:
         """The same of ranges."""
         fresh = self._slow.fresh(closed, [pair])
         nats, shift_m = _alone(fresh.value, fresh.whiten, np.square([RANGES_STEP_M]))
-        spoiled = closed.pairs[pair].stuck or closed.pairs[pair].scatter > AGREEING_SCATTER
-        again = _again(self.ranges_off[pair], NAMED_NATS if spoiled else nats, shift_m)
+        spoiled = closed.pairs[pair].ranging.is_spoiled(AGREEING_SCATTER)
+        self._keep_ranges(pair, NAMED_NATS if spoiled else nats, shift_m)
+
+    def _reconsider_unheld(self, pair: Pair, ranging: Ranging) -> None:
+        """Ranges to a drone without fixes that count: they are taken back if nothing in themselves speaks against it,
+        as that drone has nothing else, and whoever uses them weighs them by what else is known."""
+        spoiled = ranging.is_spoiled(AGREEING_SCATTER)
+        self._keep_ranges(pair, NAMED_NATS if spoiled else 0.0, self.ranges_off[pair].shift_m)
+
+    def _keep_ranges(self, pair: Pair, nats: float, shift_m: Vector) -> None:
+        """As they are after another bin, or no longer off."""
+        again = _again(self.ranges_off[pair], nats, shift_m)
         if again is None:
             del self.ranges_off[pair]
         else:
             self.ranges_off[pair] = again
-
-
-def _is_of(pair: Pair, whose: Whose) -> bool:
-    return whose in pair if isinstance(whose, int) else whose == pair
 
 
 def _holds(other: int | tuple[Pair, ...], whose: int | tuple[Pair, ...]) -> bool:

@@ -38,8 +38,12 @@ class Fresh:
     """``(r, 3)``: from the second of a pair to the first."""
     distances_m: Vector
     """``(r,)``: between them, by their fixes less what is known of both."""
+    expected_m: Vector
+    """``(r,)``: the ranges that follow from those, and from what is known of the pairs."""
     residual_m: Vector
     """``(r,)``: what is new, not whitened."""
+    blocked_nats: Vector
+    """``(r,)``: what the scatter of a pair's ranges says for a path without a line of sight."""
     whiten: Matrix
     """``(r, r)``."""
     value: Vector
@@ -101,10 +105,13 @@ class SlowErrors:
         """What is new in the chosen pairs of a bin (at least one), linearised at what is known of their drones."""
         left = [made.pairs[pair] for pair in chosen]
         residual, directions, distances = self._left(chosen, left)
+        expected = distances + self.state[[self.of_pair(pair) for pair in chosen]]
         rows = self._rows(chosen, directions)
         noise = _noise(made, chosen, left, directions)
         whiten = np.linalg.inv(np.linalg.cholesky(rows @ self.covariance @ rows.T + noise))
-        return Fresh(tuple(chosen), directions, distances, residual, whiten, whiten @ residual, whiten @ rows)
+        value = whiten @ residual
+        blocked = np.array([each.blocked_nats for each in left])
+        return Fresh(tuple(chosen), directions, distances, expected, residual, blocked, whiten, value, whiten @ rows)
 
     def take(self, fresh: Fresh) -> Matrix:
         """Learn from what is new; gives the gain ``(N, r)`` of the whitened values, 0 where it is too much to be."""

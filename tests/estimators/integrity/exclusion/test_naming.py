@@ -126,6 +126,11 @@ def between(rows: RowTable, one: int, other: int) -> NDArray[np.intp]:
     return np.flatnonzero((rows["kind"] == Kind.RANGE) & ends)
 
 
+def pair_of(one: int, other: int) -> Pair:
+    """The ids of two slots."""
+    return min(one, other) + 1, max(one, other) + 1
+
+
 def test_a_pair_whose_ranges_are_off_is_named_and_no_receiver_and_taken_back() -> None:
     def off_for_five_seconds(rows: RowTable, t_s: float) -> None:
         rows["value"][between(rows, 1, 3)] += 8.0 * (t_s < 5.0)
@@ -188,26 +193,74 @@ def test_ranges_that_are_stuck_are_named() -> None:
     assert changes[0][0] <= 3.0
 
 
-def test_two_ranges_that_are_swapped_are_named() -> None:
+@pytest.mark.parametrize(("seed", "slot"), [(2, 0), (2, 2), (11, 1), (15, 0)])
+def test_two_ranges_that_are_swapped_are_named_and_not_the_receiver_that_they_look_like(seed: int, slot: int) -> None:
+    one, other = (slot + 1) % 5, (slot + 2) % 5
+
     def swapped(rows: RowTable, t_s: float) -> None:
-        one, other = between(rows, 0, 1)[0], between(rows, 0, 3)[0]
-        rows["value"][[one, other]] = rows["value"][[other, one]]
+        mixed = np.concatenate((between(rows, slot, one), between(rows, slot, other)))
+        rows["value"][mixed] = rows["value"][mixed[::-1]]
 
-    monitor, changes = spoiled(2, swapped)
+    monitor, changes = spoiled(seed, swapped)
     assert monitor.named == {}
-    assert changes[-1][1] == {(1, 2), (1, 4)}
+    assert changes[-1][1] == {pair_of(slot, one), pair_of(slot, other)}
 
 
-def test_a_drone_without_line_of_sight_is_named_by_its_ranges() -> None:
-    rng = np.random.default_rng(1)
+def from_both_ends(rows: RowTable) -> RowTable:
+    """With the ranges that the other ends measure of the same pairs."""
+    back = rows[rows["kind"] == Kind.RANGE]
+    back["agent"], back["other"] = back["other"].copy(), back["agent"].copy()
+    back["observer"], back["offset_s"] = back["agent"], back["offset_s"] + 0.02
+    for axis in "xyz":
+        back[axis] *= -1.0
+    return np.concatenate((rows, back))
+
+
+@pytest.mark.parametrize("drones", [3, 5])
+@pytest.mark.parametrize("seed", range(2))
+def test_what_one_end_of_a_pair_measures_otherwise_than_the_other_is_off_in_any_fleet(drones: int, seed: int) -> None:
+    # no receiver makes two ends differ, so the ranges are named where nobody could tell whose receiver is off
+    monitor, named_after_s = NamingMonitor(1, PERIOD_S), list[float]()
+    for tick, rows in rows_of_flight(drones, seed, 40.0):
+        rows = from_both_ends(rows)
+        wrong = (rows["kind"] == Kind.RANGE) & (rows["agent"] == 1) & (rows["other"] == 0)
+        rows["value"][wrong] += 3.0 * (200 <= tick < 250)
+        monitor.observe(SharedTick(tick, tuple(range(1, drones + 1)), rows))
+        assert monitor.named == {}
+        assert monitor.unattributable_nats == 0.0
+        assert set(monitor.ranges_off) <= {(1, 2)}
+        named_after_s += [tick * PERIOD_S - 20.0] if monitor.ranges_off else []
+    assert named_after_s[0] <= 1.5
+    assert 15.0 <= named_after_s[-1] <= 19.0
+
+
+def test_ranges_to_a_drone_that_has_lost_its_fixes_count_again() -> None:
+    # nothing can be held against them any more, and that drone has nothing else
+    rng = np.random.default_rng(2)
+    monitor, off = NamingMonitor(1, PERIOD_S), list[float]()
+    for tick, rows in rows_of_flight(5, 4, 50.0):
+        rows["value"][between(rows, 1, 3)] += rng.exponential(4.0, len(between(rows, 1, 3))) * (200 <= tick < 300)
+        rows = rows[~((rows["kind"] == Kind.POSITION) & (rows["agent"] == 3) & (tick >= 230))]
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows))
+        assert set(monitor.ranges_off) <= {(2, 4)}
+        off += [tick * PERIOD_S] if monitor.ranges_off else []
+    assert monitor.named == {}
+    assert off[0] <= 23.0
+    assert 39.0 <= off[-1] <= 46.0  # ten seconds after they no longer scatter
+
+
+@pytest.mark.parametrize(("seed", "draws", "slot"), [(3, 1, 2), (10, 15, 0), (6, 11, 1)])
+def test_a_drone_without_line_of_sight_is_named_by_its_ranges(seed: int, draws: int, slot: int) -> None:
+    rng = np.random.default_rng(draws)
 
     def blocked(rows: RowTable, t_s: float) -> None:
-        of = (rows["kind"] == Kind.RANGE) & ((rows["agent"] == 2) | (rows["other"] == 2))
+        of = (rows["kind"] == Kind.RANGE) & ((rows["agent"] == slot) | (rows["other"] == slot))
         rows["value"][of] += rng.exponential(2.0, np.count_nonzero(of))
 
-    monitor, changes = spoiled(3, blocked)
+    monitor, changes = spoiled(seed, blocked)
     assert monitor.named == {}
-    (when,) = {t_s for t_s, pairs in changes if pairs == {(1, 3), (2, 3), (3, 4), (3, 5)}}
+    whole = {pair_of(slot, other) for other in range(5) if other != slot}
+    (when,) = {t_s for t_s, pairs in changes if pairs == whole}
     assert when <= 3.0
 
 
@@ -216,13 +269,9 @@ def test_ends_that_measure_the_same_pair_differently_are_no_scatter(seed: int) -
     # antennas have lobes: what one end of a pair measures may be off by a constant against what its other end does
     monitor = NamingMonitor(1, PERIOD_S)
     for tick, rows in rows_of_flight(5, seed, 15.0):
-        back = rows[rows["kind"] == Kind.RANGE]
-        back["agent"], back["other"] = back["other"].copy(), back["agent"].copy()
-        back["value"][between(back, 1, 3)] += 0.4
-        back["offset_s"] += 0.02
-        for axis in "xyz":
-            back[axis] *= -1.0
-        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), np.concatenate((rows, back))))
+        sensed = from_both_ends(rows)
+        sensed["value"][len(rows) :][between(sensed[len(rows) :], 1, 3)] += 0.4
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), sensed))
         assert monitor.ranges_off == {}
     assert monitor.named == {}
 

@@ -22,10 +22,14 @@ import numpy as np
 from estimators.integrity.finding import Finding, Gravity, What
 from estimators.integrity.sets.ellipsoid import Ellipsoid
 from estimators.integrity.sets.relative import Conflict, RelativeBounds, RelativeFilter
+from estimators.integrity.thresholds import AGREEING_S
 from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 
 LATE_TICKS = 16
 """Rows older than this are left out."""
+REPEATED_S = 0.5
+"""What is found of a neighbour again after so long is no single outlier, and stands until it has agreed for a while:
+a bound that is broken for good, as by a bias, shows only now and then, when the errors of both sensors add up."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,6 +110,24 @@ class _Track:
         return fits
 
 
+@dataclass(frozen=True, slots=True)
+class _Spell:
+    """What was found of a neighbour of late: since when, the last time, and the gravest of it."""
+
+    since_s: float
+    last_s: float
+    gravest: Finding
+
+    def again(self, now_s: float, found: Finding) -> _Spell:
+        """With what is found now."""
+        gravest = found if found.gravity > self.gravest.gravity else self.gravest
+        return _Spell(self.since_s, now_s, gravest)
+
+    @property
+    def repeated(self) -> bool:
+        return self.last_s - self.since_s >= REPEATED_S
+
+
 class SetBank:
     """The guaranteed sets of all neighbours of one drone."""
 
@@ -115,6 +137,7 @@ class SetBank:
         self._tick: int | None = None
         self._tracks: dict[int, _Track] = {}
         self._filters: dict[int, RelativeFilter] = {}
+        self._spells: dict[int, _Spell] = {}
         self.conflicts: dict[int, int] = {}
         """Ticks whose bounds contradicted each other, by the neighbour's id."""
 
@@ -125,7 +148,10 @@ class SetBank:
         return {agent: each for agent, each in found.items() if each is not None}
 
     def observe(self, evidence: BoundedTick) -> tuple[Finding, ...]:
-        """A finding about each neighbour whose bounds contradict each other, or whose estimate is outside its set."""
+        """A finding about each neighbour whose bounds contradict each other, or whose estimate is outside its set.
+
+        What comes again stands until nothing has been found for `AGREEING_S`.
+        """
         rows, half = self._bounded(evidence.rows)
         rows, half = _recent(rows, half, evidence.tick)
         if self._tick is not None and not 0 < evidence.tick - self._tick <= LATE_TICKS:
@@ -144,7 +170,18 @@ class SetBank:
             conflict = self._filters[agent].observe(bounds)
             self.conflicts[agent] = self._filters[agent].conflicts
             found += self._findings(agent, conflict, evidence.relative.get(agent))
-        return tuple(found)
+        return (*found, *self._standing(found, evidence.tick * self._period_s))
+
+    def _standing(self, found: Sequence[Finding], now_s: float) -> list[Finding]:
+        """What was found again and again of late, and is not among what is found now."""
+        self._spells = {agent: each for agent, each in self._spells.items() if now_s - each.last_s <= AGREEING_S}
+        for each in found:
+            if each.about is not None:
+                spell = self._spells.get(each.about) or _Spell(now_s, now_s, each)
+                self._spells[each.about] = spell.again(now_s, each)
+        said = {(each.about, each.what) for each in found}
+        repeated = [each.gravest for each in self._spells.values() if each.repeated]
+        return [each for each in repeated if (each.about, each.what) not in said]
 
     def _findings(self, agent: int, conflict: Conflict, relative: Vector | None) -> list[Finding]:
         if conflict is not Conflict.NONE:
@@ -162,6 +199,7 @@ class SetBank:
         """Begin with those who have come, let go who has left."""
         self._tracks = {agent: self._tracks.get(agent) or _Track() for agent in agents}
         self._filters = {agent: self._filters.get(agent) or RelativeFilter(self._period_s) for agent in agents}
+        self._spells = {agent: each for agent, each in self._spells.items() if agent in self._tracks}
 
     def _bounded(self, rows: RowTable) -> tuple[RowTable, Vector]:
         """Rows with a bound, and their half widths: those that they state, or else the configured ones."""

@@ -102,6 +102,20 @@ def test_fixes_beyond_their_bound_break_it_and_are_named() -> None:
     assert bank.conflicts[9] > 0
 
 
+def test_what_is_broken_again_stands_until_it_has_agreed_and_one_outlier_does_not() -> None:
+    bank, rng = SetBank(PERIOD_S, BOUNDS), np.random.default_rng(0)
+    list(run(bank, range(50), rng))
+    told = {}
+    for tick in range(50, 250):
+        off = np.array([0.0, 0.0, 12.0]) * (tick in (60, 100, 130))  # each within ten seconds of the last
+        relative = {IDS[k]: place(k, tick * PERIOD_S) - place(0, tick * PERIOD_S) + off * (k == 1) for k in (1, 2)}
+        found = bank.observe(BoundedTick(tick, IDS, 0, rows_of(tick, rng), relative))
+        told[tick] = {(each.what, each.gravity, each.about) for each in found}
+    alarm = {(What.DIVERGED, Gravity.ALARM, 7)}
+    assert [tick for tick, each in told.items() if each == alarm] == [60, *range(100, 231)]
+    assert not any(told[tick] for tick in told if tick != 60 and not 100 <= tick <= 230)
+
+
 def test_without_bounds_nothing_is_certain_and_nothing_is_found() -> None:
     bank = SetBank(PERIOD_S, SensorBounds())
     assert [found for _, found in run(bank, range(20), np.random.default_rng(0)) if found] == []

@@ -17,7 +17,7 @@ from agent.config.structs import read_struct
 from agent.config.tables import TransportTable
 from agent.radio.radio_faults import RadioOutage
 from fleetloc.errors import InputError
-from sim_bridge.faults.fault_tables import FaultTable, UwbWrong
+from sim_bridge.faults.fault_tables import FaultTable, OfRanges, UwbSwapped
 
 ROWS_FILE = Path(__file__).with_name("fault_rows.toml")
 
@@ -59,6 +59,9 @@ class FaultRow(Table, frozen=True):
     """How long the flight goes on after the last fault."""
     smallest_fleet: int = 1
     """Fleets with fewer drones leave the row out."""
+    attributable_from: int = 1
+    """Fleets with fewer drones cannot tell whose fault it is, or have too few ranges to hold a drone without its
+    receiver. They are held to what they say in time, to sigmas where no alarm stands, and not to the ratio."""
     ratio_at_most: float | None = None
     """Bound of the fleet's position RMSE while it lasts, over that of the same seeds without it; absent = none."""
     sigmas_at_most: float = 3.0
@@ -106,7 +109,12 @@ class _Rows(Table, frozen=True):
 def _placed(fault: FaultTable, ids: Sequence[int]) -> FaultTable | None:
     """A fault with ids in place of places; ``None`` if none of the drones that it names is there."""
     agents = tuple(ids[place - 1] for place in fault.agents if place <= len(ids))
-    if not isinstance(fault, UwbWrong):
+    if isinstance(fault, UwbSwapped):
+        if max(fault.between) > len(ids):
+            return None
+        one, other = fault.between
+        fault = msgspec.structs.replace(fault, between=(ids[one - 1], ids[other - 1]))
+    if not isinstance(fault, OfRanges):
         return msgspec.structs.replace(fault, agents=agents) if agents else None
     pairs = tuple((ids[a - 1], ids[b - 1]) for a, b in fault.pairs if max(a, b) <= len(ids))
     named = fault.agents or fault.pairs

@@ -93,6 +93,7 @@ def row_figures(row: FaultRow, flown: Pooled) -> Figures:
     figures |= _honesty(flown, since, during, hit)
     figures["back_after_s"] = back_after_s(flown, ticks[2], ticks[3])
     figures["flagged_after_s"] = _flagged_after_s(flown, during, hit)
+    figures["attributable"] = len(flown.ids) >= row.attributable_from
     figures["misses"] = misses(row, figures)
     return figures
 
@@ -123,6 +124,7 @@ def _honesty(flown: Pooled, since: slice, during: slice, hit: Sequence[int]) -> 
     claimed, actual = _rms(stacked("sigma_m", during, hit)), _rms(stacked("error_m", during, hit))
     return {
         "sigmas_p99": _over(lambda values: np.percentile(values, P99), error / sigma),
+        "sigmas_p99_unalarmed": _over(lambda values: np.percentile(values, P99), (error / sigma)[~alarm]),
         "anees_own": _over(np.mean, stacked("nees")),
         "anees_own_hit": _over(np.mean, stacked("nees", slots=hit)),
         "anees_fleet": _over(np.mean, stacked("nees_fleet")),
@@ -156,14 +158,20 @@ def _flagged_after_s(flown: Pooled, during: slice, hit: Sequence[int]) -> float 
 
 
 def misses(row: FaultRow, figures: Figures) -> list[str]:
-    """Which of a row's bounds its figures do not keep, in words."""
-    ratio = figures["during"]["position_ratio_all"]
+    """Which of a row's bounds its figures do not keep, in words.
+
+    Where nobody can tell whose fault it is, an estimate is pulled along, and an alarm has to say so.
+    """
+    ratio, sigmas, ratio_at_most = figures["during"]["position_ratio_all"], figures["sigmas_p99"], row.ratio_at_most
+    if not figures["attributable"]:
+        unalarmed = figures["sigmas_p99_unalarmed"]
+        ratio_at_most, sigmas = None, 0.0 if math.isnan(unalarmed) else unalarmed
     back_s, flag_s = (
         math.inf if figures[name] is None else figures[name] for name in ("back_after_s", "flagged_after_s")
     )
     bounds = (
-        ("ratio", ratio, row.ratio_at_most),
-        ("sigmas", figures["sigmas_p99"], row.sigmas_at_most),
+        ("ratio", ratio, ratio_at_most),
+        ("sigmas", sigmas, row.sigmas_at_most),
         ("back s", back_s, row.back_within_s),
         ("flag s", flag_s, row.flag_within_s),
         ("claim", figures["claimed_over_actual_hit"], row.claim_at_most),

@@ -72,22 +72,13 @@ class AccelWrong(_OfAgents, frozen=True, kw_only=True, tag_field="kind", tag="ac
     """The largest value that an axis can say; below 1 g it is less than gravity. Absent = no limit."""
 
 
-class UwbWrong(Spell, frozen=True, kw_only=True, tag_field="kind", tag="uwb_wrong"):
-    """Ranges that are too long: by a bias, and some of them as without line of sight.
-
-    It hits the ranges from and to ``agents`` and those of ``pairs``, both ways; all ranges where neither is given.
-    """
+class OfRanges(Spell, frozen=True, kw_only=True):
+    """Of ranges from and to ``agents`` and those of ``pairs``, both ways; of all where neither is given."""
 
     agents: tuple[AgentId, ...] = ()
     """Whose, both ways."""
     pairs: tuple[tuple[AgentId, AgentId], ...] = ()
     """Between whom, both ways."""
-    bias_m: float = 0.0
-    """Of every range."""
-    nlos_share: Fraction = 0.0
-    """Of the ranges, drawn one by one, that are too long by an exponential besides."""
-    nlos_mean_m: Positive = 1.0
-    """Its mean."""
 
     def hits(self, observer: int, target: int) -> bool:
         """Whether the ranges from one agent to another are among them."""
@@ -95,6 +86,34 @@ class UwbWrong(Spell, frozen=True, kw_only=True, tag_field="kind", tag="uwb_wron
             return True
         either = observer in self.agents or target in self.agents
         return either or (observer, target) in self.pairs or (target, observer) in self.pairs
+
+
+class UwbWrong(OfRanges, frozen=True, kw_only=True, tag_field="kind", tag="uwb_wrong"):
+    """Ranges that are too long: by a bias, and some of them as without line of sight.
+
+    It hits the ranges from and to ``agents`` and those of ``pairs``, both ways; all ranges where neither is given.
+    """
+
+    bias_m: float = 0.0
+    """Of every range."""
+    nlos_share: Fraction = 0.0
+    """Of the ranges, drawn one by one, that are too long by an exponential besides."""
+    nlos_mean_m: Positive = 1.0
+    """Its mean."""
+
+
+class UwbStuck(OfRanges, frozen=True, kw_only=True, tag_field="kind", tag="uwb_stuck"):
+    """Modules repeat the first range that they measured of each other since, with fresh stamps.
+
+    It hits the ranges from and to ``agents`` and those of ``pairs``, both ways; all ranges where neither is given.
+    """
+
+
+class UwbSwapped(_OfAgents, frozen=True, kw_only=True, tag_field="kind", tag="uwb_swapped"):
+    """The modules of ``agents`` mix up two others: what they measure of one they say of the other."""
+
+    between: tuple[AgentId, AgentId]
+    """The two."""
 
 
 class MemberStuck(_OfAgents, frozen=True, kw_only=True, tag_field="kind", tag="member_stuck"):
@@ -115,14 +134,15 @@ class MemberWrong(_OfAgents, frozen=True, kw_only=True, tag_field="kind", tag="m
     """Covariances that it sends are its own over this."""
 
 
-SensorFault = GpsOff | GpsStuck | GpsWrong | GpsDrift | AccelWrong | UwbWrong
+RangeFault = UwbWrong | UwbStuck | UwbSwapped
+SensorFault = GpsOff | GpsStuck | GpsWrong | GpsDrift | AccelWrong | RangeFault
 MemberFault = MemberStuck | MemberWrong
 FaultTable = SensorFault | MemberFault
 
 
 def about(fault: FaultTable) -> frozenset[int]:
     """Agents that a fault names; none for one that hits everybody."""
-    pairs = fault.pairs if isinstance(fault, UwbWrong) else ()
+    pairs = fault.pairs if isinstance(fault, OfRanges) else ()
     return frozenset(fault.agents).union(*pairs)
 
 
@@ -136,13 +156,15 @@ def _wrong(fault: FaultTable, config: FleetConfig, key: str) -> Iterator[Fault]:
     yield from unknown_ids(config, f"{key}.agents", fault.agents)
     if fault.end_s <= fault.from_s:
         yield Fault(f"{key}.to_s", f"later than from_s = {fault.from_s:g}", f"{fault.to_s:g}")
+    pairs = {f"{key}.pairs[{number}]": pair for number, pair in enumerate(getattr(fault, "pairs", ()))}
+    if isinstance(fault, UwbSwapped):
+        pairs[f"{key}.between"] = fault.between
+    for where, pair in pairs.items():
+        yield from unknown_ids(config, where, pair)
+        if pair[0] == pair[1]:
+            yield Fault(where, "two different agents", f"{list(pair)}")
     match fault:
-        case UwbWrong():
-            for number, pair in enumerate(fault.pairs):
-                yield from unknown_ids(config, f"{key}.pairs[{number}]", pair)
-                if pair[0] == pair[1]:
-                    yield Fault(f"{key}.pairs[{number}]", "two different agents", f"{list(pair)}")
-            if fault.bias_m == 0.0 and fault.nlos_share == 0.0:
-                yield Fault(f"{key}.bias_m", "a bias_m or a nlos_share other than 0", "neither")
+        case UwbWrong() if fault.bias_m == 0.0 and fault.nlos_share == 0.0:
+            yield Fault(f"{key}.bias_m", "a bias_m or a nlos_share other than 0", "neither")
         case AccelWrong() if not any(fault.bias_mps2) and fault.limit_mps2 is None:
             yield Fault(f"{key}.bias_mps2", "a bias_mps2 other than 0 or a limit_mps2", "neither")

@@ -21,6 +21,8 @@ from sim_bridge.faults.fault_tables import (
     GpsStuck,
     GpsWrong,
     SensorFault,
+    UwbStuck,
+    UwbSwapped,
     UwbWrong,
 )
 
@@ -54,6 +56,8 @@ class SensorFaults:
         ]
         self._held: dict[tuple[int, int], Any] = {}
         """The fix that is repeated, by fault and agent."""
+        self._held_m: dict[tuple[int, int, int], float] = {}
+        """The range that is repeated, by fault, who measures, and whom."""
 
     def gps_off(self, agent: int, time_s: float) -> bool:
         """Whether a receiver has no fix."""
@@ -97,6 +101,20 @@ class SensorFaults:
                 extra_m = fault.bias_m + (detour_m if blocked else 0.0)
                 error = RangeError(error.extra_m + extra_m, error.blocked or blocked)
         return error
+
+    def said_m(self, observer: int, target: int, time_s: float, range_m: float) -> float:
+        """What a stuck module says in place of a range: the first one since it stuck; else the range itself."""
+        for number, fault in enumerate(self._sensor):
+            if isinstance(fault, UwbStuck) and fault.holds(time_s) and fault.hits(observer, target):
+                return self._held_m.setdefault((number, observer, target), range_m)
+        return range_m
+
+    def said_of(self, observer: int, target: int, time_s: float) -> int:
+        """Of whom a module says what it measured of an agent."""
+        for fault in self._sensor:
+            if isinstance(fault, UwbSwapped) and target in fault.between and _hits(fault, observer, time_s):
+                return fault.between[fault.between[0] == target]
+        return target
 
 
 def _hits(fault: SensorFault, agent: int, time_s: float) -> bool:

@@ -110,7 +110,10 @@ class Injection:
 
     def range(self, line: RangeLine) -> RangeLine:
         """What the modules measure."""
-        error = self._sensors.range_error(line.observer, line.target, line.time_s - self.start_s)
-        if error.extra_m == 0.0:
+        ends, time_s = (line.observer, line.target), line.time_s - self.start_s
+        error = self._sensors.range_error(*ends, time_s)
+        range_m = line.range_m if error.extra_m == 0.0 else max(line.range_m + error.extra_m, LEAST_RANGE_M)
+        said_m, target = self._sensors.said_m(*ends, time_s, range_m), self._sensors.said_of(*ends, time_s)
+        if said_m == line.range_m and target == line.target:
             return line
-        return replace(line, range_m=max(line.range_m + error.extra_m, LEAST_RANGE_M))
+        return replace(line, target=target, range_m=said_m)

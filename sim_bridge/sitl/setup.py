@@ -8,7 +8,7 @@ from agent.config.endpoints import SPELLINGS, Endpoint, LinkKind, parse_endpoint
 from agent.config.faults import Fault
 from agent.config.tables import FleetConfig
 from agent.errors import ConfigError, EndpointError
-from sim_bridge.faults.fault_tables import UwbWrong
+from sim_bridge.faults.fault_tables import RangeFault
 from sim_bridge.sitl.sitl_table import sitl_table
 from sim_bridge.world.sim_table import sim_table
 
@@ -78,8 +78,8 @@ def _check_height(config: FleetConfig) -> None:
 def _check_faults(config: FleetConfig) -> None:
     """Only the ranges are simulated here; the other sensors are the simulators' own."""
     for index, fault in enumerate(sim_table(config).faults):
-        if not isinstance(fault, UwbWrong):
-            expected = "uwb_wrong with real firmware (fixes are left out by sim.gps_outages)"
+        if not isinstance(fault, RangeFault):
+            expected = "uwb_wrong, uwb_stuck, uwb_swapped with real firmware (fixes: sim.gps_outages)"
             raise _error(config, f"sim.faults[{index}].kind", expected, f'"{fault.__struct_config__.tag}"')
 
 

@@ -23,6 +23,7 @@ from agent.inputs import Journal
 from agent.mavlink.sample_adapter import SampleAdapter
 from agent.onboard import OnboardAgent
 from agent.sensing.frames import FleetFrame
+from agent.sensing.samples import AttitudeSample
 from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.fleet_events import FleetEvents
@@ -212,6 +213,8 @@ class FleetLockstep:
         host_s, drones = self.queue.now_s, self.fleet.drones
         for agent_id, sample in sensed.samples:
             if agent_id in drones:
+                if isinstance(sample, AttitudeSample) and self._fixes[agent_id].frozen:
+                    sample = replace(sample, receiver_frozen=True)  # as the session says of real bytes
                 drones[agent_id].agent.on_sample(sample, host_s)
         for agent_id, message in sensed.fixes:
             if agent_id in drones:

@@ -493,8 +493,11 @@ class FleetSensors:
         if not distance_m <= self._scenario.uwb_reach_m:  # so that of nowhere, in SITL, nothing is measured
             return None
         bearing_rad = math.atan2(east, north) - float(self._world.yaw_rad[slot])
-        fault = self._faults.range_error(observer, target, self._world.time_s)
-        return self._channel.measure(observer, target, distance_m, bearing_rad, fault)
+        time_s = self._world.time_s
+        fault = self._faults.range_error(observer, target, time_s)
+        taken = self._channel.measure(observer, target, distance_m, bearing_rad, fault)
+        said_m = self._faults.said_m(observer, target, time_s, taken.range_m)
+        return replace(taken, target=self._faults.said_of(observer, target, time_s), range_m=said_m)
 
     def _turn(self, slot: int, there: int) -> tuple[int, int]:
         """Between which antennas the next range is; other bodies, in place of a slot their negative id, have one."""

@@ -21,7 +21,7 @@ from fleetloc.bench.fault_rows import FaultRow
 from fleetloc.bench.integrity.flights import KeptFlight, Promises, first_drones, promises_of
 from fleetloc.errors import InputError
 from fleetloc.output import print_table, progress_bar
-from sim_bridge.faults.fault_tables import GpsDrift, GpsStuck, GpsWrong, MemberStuck, MemberWrong, UwbWrong, about
+from sim_bridge.faults.fault_tables import GpsDrift, GpsStuck, GpsWrong, MemberStuck, MemberWrong, RangeFault, about
 from sim_bridge.studies.monte_carlo import Hangar
 
 Figures = dict[str, Any]
@@ -43,15 +43,16 @@ class SizedRow:
         """Slots of those whose fixes are wrong, and of those with wrong ranges."""
         faults = () if self.row is None else self.row.faults
         fixes = frozenset().union(*(about(each) for each in faults if isinstance(each, OF_FIXES)))
-        ranges = frozenset().union(*(about(each) for each in faults if isinstance(each, UwbWrong)))
+        ranges = frozenset().union(*(about(each) for each in faults if isinstance(each, RangeFault)))
         ids = self.config.ids
         return frozenset(map(ids.index, fixes)), frozenset(map(ids.index, ranges))
 
     @property
     def undetectable(self) -> bool:
         """Whether nobody can tell who is wrong: of few drones, or where all are alike."""
-        count = len(self.config.ids)
-        fixes, _ = self.culprits
+        count, (fixes, _) = len(self.config.ids), self.culprits
+        if self.row is None or count < self.row.attributable_from:
+            return self.row is not None
         return bool(fixes) and (count < FEWEST_RECEIVERS or len(fixes) == count)
 
     def flights(self, seeds: Sequence[int]) -> list[Flight]:
@@ -135,7 +136,7 @@ def _times(case: SizedRow, flown: Promises, begin: int, end: int) -> dict[str, A
         named = np.isin(np.arange(said.shape[1]), list(culprits))
         right |= said[:, named].any(1)
     wrong |= off[0][:, [slot for slot in range(off[0].shape[1]) if slot not in fixes]].any(1)
-    if not ranges and not (case.row is not None and any(isinstance(each, UwbWrong) for each in case.row.faults)):
+    if not ranges and not (case.row is not None and any(isinstance(each, RangeFault) for each in case.row.faults)):
         wrong |= off[1][:, [slot for slot in range(off[1].shape[1]) if slot not in fixes]].any(1) & ~right
     anything = off[0].any(1) | off[1].any(1) | flown.somebody.any(1)
     since = slice(begin, None)

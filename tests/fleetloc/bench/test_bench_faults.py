@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import typing
 from pathlib import Path
 
 import msgspec
@@ -17,7 +18,7 @@ from fleetloc.bench.fault_flights import Flight, History
 from fleetloc.bench.fault_rows import ROWS_FILE, FaultRow, RadioSpell, chosen_rows, read_rows
 from fleetloc.bench.faults import Pooled, back_after_s, row_figures
 from fleetloc.errors import InputError
-from sim_bridge.faults.fault_tables import FaultTable, GpsOff, GpsWrong, UwbWrong, about, wrong_settings
+from sim_bridge.faults.fault_tables import FaultTable, GpsOff, GpsWrong, UwbSwapped, UwbWrong, about, wrong_settings
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 PERIOD_S = 0.1
@@ -37,7 +38,7 @@ def test_every_row_that_comes_along_can_be_flown_by_the_shipped_fleets(fleet: st
             assert not list(wrong_settings(row.faults, config, "rows"))
             assert row.begin_s < row.end_s < row.duration_s
     kinds = {fault.__struct_config__.tag for row in read_rows(ROWS_FILE) for fault in row.faults}
-    assert kinds == {kind.__struct_config__.tag for kind in FaultTable.__args__}
+    assert kinds == {kind.__struct_config__.tag for kind in typing.get_args(FaultTable)}
 
 
 def test_agents_of_a_row_are_places_in_the_fleet() -> None:
@@ -49,12 +50,15 @@ def test_agents_of_a_row_are_places_in_the_fleet() -> None:
             GpsOff(agents=(8, 9), to_s=6.0),
             UwbWrong(pairs=((1, 3), (1, 9)), to_s=7.0, bias_m=1.0),
             UwbWrong(to_s=8.0, bias_m=1.0),
+            UwbSwapped(agents=(2,), between=(3, 1), to_s=8.0),
+            UwbSwapped(agents=(2,), between=(3, 4), to_s=8.0),
         ),
     )
     placed = row.placed((10, 20, 30))
     assert placed is not None
-    assert [sorted(about(fault)) for fault in placed.faults] == [[10, 20], [10, 30], []]
+    assert [sorted(about(fault)) for fault in placed.faults] == [[10, 20], [10, 30], [], [20]]
     assert placed.faults[1].pairs == ((10, 30),)
+    assert placed.faults[3].between == (30, 10)
     assert msgspec.structs.replace(row, smallest_fleet=4).placed((10, 20, 30)) is None
     assert msgspec.structs.replace(row, faults=row.faults[1:2]).placed((10, 20, 30)) is None
 
@@ -194,6 +198,26 @@ def test_what_the_drones_say_of_it() -> None:
     assert "flag s 0.5 > 0.4" in row_figures(late, pooled(faulted()))["misses"]
     assert not [each for each in row_figures(prompt, pooled(faulted()))["misses"] if each.startswith("flag")]
     assert "flag s inf > 0.5" in row_figures(prompt, pooled(quiet))["misses"]
+
+
+def test_fleets_too_small_to_tell_whose_fault_it_is_are_held_to_what_they_say_of_it() -> None:
+    of_few = msgspec.structs.replace(ROW, attributable_from=3, flag_within_s=0.5)
+    silent = row_figures(of_few, pooled(faulted()))
+    assert not silent["attributable"]
+    assert silent["misses"] == ["sigmas 40 > 3", "misleads"]
+    alarm = np.zeros((TICKS, 2), bool)
+    alarm[40:61, 1] = True
+    told = row_figures(of_few, pooled(history_with(faulted(), alarm=alarm)))
+    assert told["sigmas_p99"] == pytest.approx(40.0)
+    assert told["sigmas_p99_unalarmed"] == pytest.approx(4.0)  # after it, when the alarm is gone
+    assert told["misses"] == ["sigmas 4 > 3"]
+    late = row_figures(msgspec.structs.replace(of_few, flag_within_s=0.4), pooled(faulted()))
+    assert "flag s 0.5 > 0.4" in late["misses"]
+    # a fleet that can tell is held to all
+    assert (
+        "ratio 14.2 > 2"
+        in row_figures(msgspec.structs.replace(of_few, attributable_from=2), pooled(faulted()))["misses"]
+    )
 
 
 def test_a_fleet_is_back_when_it_stays_as_good_as_without_the_fault() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -14,7 +15,7 @@ from fleetloc.bench.fault_rows import FaultRow
 from fleetloc.bench.integrity.flights import Promises, first_drones
 from fleetloc.bench.integrity.study import SizedRow, case_figures, cases
 from fleetloc.errors import InputError
-from sim_bridge.faults.fault_tables import GpsWrong
+from sim_bridge.faults.fault_tables import GpsWrong, UwbWrong
 from sim_bridge.world.sim_table import sim_table
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -64,6 +65,11 @@ def test_of_three_drones_nobody_can_tell() -> None:
     assert case(3).undetectable
     assert not case(5).undetectable
     assert not case(3, None).undetectable
+    bias = FaultRow(name="bias", title="x", faults=(UwbWrong(pairs=((1, 2),), to_s=5.0, bias_m=0.4),))
+    assert not case(3, bias).undetectable
+    bias = msgspec.structs.replace(bias, attributable_from=4)
+    assert case(3, bias).undetectable
+    assert not case(4, bias).undetectable
 
 
 def test_smaller_fleets_are_the_first_drones() -> None:

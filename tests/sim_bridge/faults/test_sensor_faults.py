@@ -9,7 +9,16 @@ import pytest
 
 from agent.config.reading import load_config
 from agent.errors import ConfigError
-from sim_bridge.faults.fault_tables import AccelWrong, GpsDrift, GpsOff, GpsStuck, GpsWrong, UwbWrong
+from sim_bridge.faults.fault_tables import (
+    AccelWrong,
+    GpsDrift,
+    GpsOff,
+    GpsStuck,
+    GpsWrong,
+    UwbStuck,
+    UwbSwapped,
+    UwbWrong,
+)
 from sim_bridge.world.scenario import Scenario, Vehicle
 from sim_bridge.world.sensors import GpsFix
 from sim_bridge.world.sim_table import sim_table
@@ -155,6 +164,26 @@ def test_a_block_without_line_of_sight_lengthens_its_share_of_ranges_and_shows_i
     assert np.array(extra).min() > -1e-9
 
 
+def test_stuck_modules_repeat_the_first_range_since_each_way_its_own(clean, with_fault):
+    faulty = with_fault(UwbStuck(pairs=((1, 2),), from_s=FROM_S, to_s=TO_S))
+    held: dict[tuple[int, int], float] = {}
+    for (observer, target, time_s), (range_m, nlos) in clean.ranges.items():
+        if {observer, target} == {1, 2} and in_fault(time_s):
+            range_m = held.setdefault((observer, target), range_m)
+        assert faulty.ranges[observer, target, time_s] == (range_m, nlos)
+    assert held.keys() == {(1, 2), (2, 1)}
+
+
+def test_a_module_that_mixes_up_two_others_says_of_each_what_it_measured_of_the_other(clean, with_fault):
+    faulty = with_fault(UwbSwapped(agents=(2,), between=(1, 3), from_s=FROM_S, to_s=TO_S))
+    swapped = 0
+    for (observer, target, time_s), measured in clean.ranges.items():
+        wrong = observer == 2 and in_fault(time_s)
+        assert faulty.ranges[observer, {1: 3, 3: 1}[target] if wrong else target, time_s] == measured
+        swapped += wrong
+    assert swapped > 10
+
+
 def test_one_seed_draws_the_same_fault_and_another_seed_another(make_scenario):
     block = UwbWrong(nlos_share=0.5)
     runs = [Measured(make_scenario(*THREE, faults=(block,), seed=seed)).ranges for seed in (3, 3, 4)]
@@ -172,6 +201,8 @@ def test_one_seed_draws_the_same_fault_and_another_seed_another(make_scenario):
         ('{kind="gps_of", agents=[1]}', "sim.faults, entry 1, kind", "gps_off"),
         ('{kind="uwb_wrong", pairs=[[1, 1]], bias_m=1.0}', "sim.faults, entry 1, pairs", "two different agents"),
         ('{kind="uwb_wrong", agents=[1]}', "sim.faults, entry 1, bias_m", "other than 0"),
+        ('{kind="uwb_stuck", pairs=[[1, 7]]}', "sim.faults, entry 1, pairs", "ids of agents (1, 2, 3)"),
+        ('{kind="uwb_swapped", agents=[2], between=[3, 3]}', "sim.faults, entry 1, between", "two different agents"),
         ('{kind="accel_wrong", agents=[1]}', "sim.faults, entry 1, bias_mps2", "limit_mps2"),
     ],
 )

@@ -137,6 +137,21 @@ def test_ranges_of_a_pair_are_too_long_both_ways(clean: Heard) -> None:
     assert changed == {(1, 3), (3, 1)}
 
 
+def test_ranges_are_stuck_or_said_of_another(clean: Heard) -> None:
+    stuck = Heard(f'kind="uwb_stuck", pairs=[[3, 1]], {WHILE}').by_kind[RangeLine]
+    swapped = Heard(f'kind="uwb_swapped", agents=[2], between=[1, 3], {WHILE}').by_kind[RangeLine]
+    said: dict[tuple[int, int], set[float]] = defaultdict(set)
+    for (observer, target, time_s), was in clean.by_kind[RangeLine].items():
+        during = FROM_S <= time_s < TO_S
+        if during and {observer, target} == {1, 3}:
+            said[observer, target].add(stuck[observer, target, time_s].range_m)
+        else:
+            assert stuck[observer, target, time_s] == was
+        said_of = {1: 3, 3: 1}[target] if during and observer == 2 else target
+        assert swapped[observer, said_of, time_s].range_m == was.range_m
+    assert [len(each) for each in said.values()] == [1, 1]
+
+
 def test_what_is_random_follows_the_seed() -> None:
     block = f'kind="uwb_wrong", agents=[1], {WHILE}, nlos_share=0.5'
     one, same, other = (Heard(block, seed=seed).by_kind[RangeLine] for seed in (1, 1, 2))

@@ -142,9 +142,9 @@ class MeasurementStore:
         proof_of = by_origin(proofs or ())
         taken = []
         for record in records:
-            kept = self._kept_of(record)
+            kept = self._kept_of(record)  # mostly it is there already: neighbours say back what they heard
             proof = proof_of.get(origin(record)) if proof_of else None
-            if self._wanted(record, tick):
+            if record.observer != self._agent_id and (kept is not None or self._wanted(record, tick)):
                 if kept is None:
                     if proof is None and proofs is not None and record.observer != sender:
                         self.refused[f"heard: not proven, of {sender}"] += 1
@@ -155,20 +155,19 @@ class MeasurementStore:
                     self._echoes[record.identity] = kept.record
                 if proof is not None and (kept.proof is None or record.observer == sender):
                     kept.proof = proof
-            if kept is not None:
+            if kept is not None and sender not in kept.held_by:
                 self._note_held(kept, sender, tick)
         for ack in acks:
             for of_tick in self._acked.values():
-                if ack in of_tick:
+                if ack in of_tick and sender not in of_tick[ack].held_by:
                     self._note_held(of_tick[ack], sender, tick)
         return taken
 
     def _note_held(self, kept: _Kept, sender: int, tick: int) -> None:
-        """A neighbour has said, at a tick, that it has a record."""
-        if sender not in kept.held_by:
-            kept.held_by.add(sender)
-            if kept.record.observer == self._agent_id:
-                self._echoed_after.append(max(tick - kept.record.tick, 0))
+        """A neighbour has said for the first time, at a tick, that it has a record."""
+        kept.held_by.add(sender)
+        if kept.record.observer == self._agent_id:
+            self._echoed_after.append(max(tick - kept.record.tick, 0))
 
     def take(self, tick: int, members: Sequence[int], located: Container[int]) -> tuple[RowTable, InputTable]:
         """Rows up to a tick and inputs that act before it, each handed out once; forgets what is old.
@@ -316,9 +315,7 @@ class MeasurementStore:
                 yield self._to_send[of_tick]
 
     def _wanted(self, record: Measurement, tick: int) -> bool:
-        """Whether a record that a neighbour sent is one to take in, if it is new."""
-        if record.observer == self._agent_id:
-            return False  # our own words, relayed back
+        """Whether a record that a neighbour sent, of another drone and not held yet, is one to take in."""
         if record.tick > tick + AHEAD_TICKS:
             self.refused["heard: of the future"] += 1
             return False

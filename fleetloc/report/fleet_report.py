@@ -61,9 +61,10 @@ def write_report(
         typer.echo(f"fleetloc: left out: {line}", err=True)
     for path in (directory / run_files.REPORT_JSON, *([json_file] if json_file else [])):
         write_json(path, figures)
-    (directory / run_files.REPORT_HTML).write_text(page(config, results, figures), encoding="utf-8")
     _print(figures)
     typer.echo(found.line)
+    html = page(config, results, figures, outcome.plots_until_s)
+    (directory / run_files.REPORT_HTML).write_text(html, encoding="utf-8")
     if not is_installed("report"):
         typer.echo(f"note: {sentence('report', f'{run_files.REPORT_HTML} has no plots')}")
     return figures

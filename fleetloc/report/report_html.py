@@ -5,8 +5,10 @@ Where the plotting library is missing it has the figures alone, and says so.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import time
+from collections.abc import Callable, Iterator
 from html import escape
+from types import ModuleType
 from typing import Any
 
 from agent.config.tables import FleetConfig
@@ -29,6 +31,8 @@ th:first-child, td:first-child { text-align: left; } tr.total td { font-weight: 
 .warning { background: #fff3d6; padding: 0.5em 0.8em; border-left: 4px solid #e69f00; margin: 0.3em 0; }
 """
 
+PLOTS_LEFT_OUT = "The run was interrupted: the other plots were not waited for. fleetloc report draws them."
+
 COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
     ("ticks on time", lambda row: f"{row['ticks_on_time']} of {row['ticks_expected']}"),
     ("available %", lambda row: _number(row["availability"], 1, 100)),
@@ -42,13 +46,23 @@ COLUMNS: tuple[tuple[str, Callable[[dict[str, Any]], str]], ...] = (
 )
 
 
-def page(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) -> str:
-    """The whole page of a run; ``figures`` is the content of ``report.json``."""
+def page(
+    config: FleetConfig, results: FleetResults, figures: dict[str, Any], plots_until_s: float | None = None
+) -> str:
+    """The whole page of a run; ``figures`` is the content of ``report.json``.
+
+    From ``plots_until_s`` of the monotonic clock on no plot is begun any more: who interrupts a run wants to go on.
+    """
     name, fleet = escape(config.fleet.name), figures["fleet"]
-    body = "\n".join(
-        f'<h2>{title}</h2>\n<p class="note">{escape(note)}</p>\n{svg}'
-        for title, note, svg in _drawn(config, results, figures)
-    )
+    drawn, left_out = [], False
+    for title, note, draw in _plots(config, results, figures):
+        left_out = plots_until_s is not None and time.monotonic() >= plots_until_s
+        if left_out:
+            break
+        drawn.append(f'<h2>{title}</h2>\n<p class="note">{escape(note)}</p>\n{draw()}')
+    if left_out:
+        drawn.append(f'<p class="note">{escape(PLOTS_LEFT_OUT)}</p>')
+    body = "\n".join(drawn)
     return (
         f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n<title>{name}</title>\n'
         f"<style>{CSS}</style>\n</head>\n<body>\n<h1>{name}</h1>\n"
@@ -57,28 +71,47 @@ def page(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) ->
     )
 
 
-def _drawn(config: FleetConfig, results: FleetResults, figures: dict[str, Any]) -> list[tuple[str, str, str]]:
-    """Title, note and SVG of each plot; none where the plotting library is missing."""
+def _plots(
+    config: FleetConfig, results: FleetResults, figures: dict[str, Any]
+) -> Iterator[tuple[str, str, Callable[[], str]]]:
+    """Title, note and what draws the SVG of each plot; none where the plotting library is missing."""
     if not is_installed("report"):
-        return []
+        return
+
+    yield (
+        "Where they were", "Truth pale and wide, each drone's own estimate thin on top; a dot marks the start.",
+        lambda: _plots_module().trajectories(config, results),
+    )  # fmt: skip
+    yield (
+        "Position error and its 3-sigma band",
+        "Each drone's error of its own position; the shaded band is what it claims. Grey: its GPS is out.",
+        lambda: _plots_module().errors(config, results),
+    )
+    if results.targets:
+        yield (
+            "Targets", "Error of each target's position as each drone had it; pale: the 3 sigma that it claimed.",
+            lambda: _plots_module().targets(results),
+        )  # fmt: skip
+    yield (
+        "Consistency", "Squared error of the whole fleet state in units of its covariance: near 1 is right, above "
+        "the band the estimator is overconfident, below it is cautious. Samples of one run are correlated.",
+        lambda: _plots_module().consistency(results),
+    )  # fmt: skip
+    yield (
+        "Timing", "A tick's estimate has to be out within one period of the tick's end.",
+        lambda: _plots_module().timing(results),
+    )  # fmt: skip
+    yield (
+        "Packets", "On the radio between drones. Lost: missing in the sequence numbers; injected losses included.",
+        lambda: _plots_module().packets(figures["agents"]),
+    )  # fmt: skip
+
+
+def _plots_module() -> ModuleType:
+    """It takes a second or more to load, which a page without plots does not."""
     from fleetloc.report import report_plots
 
-    return [
-        ("Where they were", "Truth pale and wide, each drone's own estimate thin on top; a dot marks the start.",
-         report_plots.trajectories(config, results)),
-        ("Position error and its 3-sigma band",
-         "Each drone's error of its own position; the shaded band is what it claims. Grey: its GPS is out.",
-         report_plots.errors(config, results)),
-        *([("Targets", "Error of each target's position as each drone had it; pale: the 3 sigma that it claimed.",
-            report_plots.targets(results))] if results.targets else []),
-        ("Consistency", "Squared error of the whole fleet state in units of its covariance: near 1 is right, above "
-         "the band the estimator is overconfident, below it is cautious. Samples of one run are correlated.",
-         report_plots.consistency(results)),
-        ("Timing", "A tick's estimate has to be out within one period of the tick's end.",
-         report_plots.timing(results)),
-        ("Packets", "On the radio between drones. Lost: missing in the sequence numbers; injected losses included.",
-         report_plots.packets(figures["agents"])),
-    ]  # fmt: skip
+    return report_plots
 
 
 def _summary(config: FleetConfig, figures: dict[str, Any]) -> str:

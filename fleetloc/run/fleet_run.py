@@ -31,6 +31,8 @@ SIMULATOR_GRACE_S = 5.0
 """After Ctrl-C the simulator has this long to write its truth, a second one kills everything."""
 DAEMONS_GRACE_S = 3.0
 """And the daemons so long to end after that."""
+PLOTS_WITHIN_S = 6.0
+"""So long after Ctrl-C the report may begin to draw a plot."""
 LATE_SHARE, SAID_EVERY_S = 0.1, 30.0
 """Ticks late since the last look from which on the machine is said to be overloaded, and how often."""
 LAST_TICKS_S = 0.5
@@ -78,6 +80,8 @@ class RunOutcome:
 
     wall_s: float = 0.0
     interrupted: bool = False
+    plots_until_s: float | None = None
+    """Instant of the monotonic clock from which on the report draws no more; ``None``: it draws all."""
     deaths: list[Death] = field(default_factory=list)
     use: dict[int, Use] = field(default_factory=dict)
     lives: dict[int, list[Diagnostics]] = field(default_factory=dict)
@@ -151,7 +155,8 @@ class FleetRun:
             for child in (self._simulator, *self._drivers, *self._daemons.values()):
                 child.kill()
         if self._kill_by_s is None:
-            self._kill_by_s = time.monotonic() + SIMULATOR_GRACE_S
+            now_s = time.monotonic()
+            self._kill_by_s, self._outcome.plots_until_s = now_s + SIMULATOR_GRACE_S, now_s + PLOTS_WITHIN_S
         self._outcome.interrupted = True
         self._stop.set()
         self._changed.set()

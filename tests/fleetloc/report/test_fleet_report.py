@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 from typing import Any
@@ -166,6 +167,19 @@ def test_report_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Non
     assert page.count("<svg") == page.count("</svg>") == 5
     assert not re.search(r"""(?:src|href)\s*=\s*["'](?!#)""", page)
     assert "agent 1 at 10.0 s: killed by SIGKILL: &lt;b&gt;" in page
+
+
+def test_who_interrupts_a_run_does_not_wait_for_plots(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    # GIVEN an interrupt so long ago that no plot may be begun
+    config, interrupted = make_run(tmp_path), outcome()
+    interrupted.interrupted, interrupted.plots_until_s = True, -math.inf
+    # WHEN the report is written THEN it has all figures and the verdict, and says where the plots are to be had
+    written = write_report(config, tmp_path, interrupted, None, "live")
+    assert written["verdict"]["line"] in capsys.readouterr().out
+    page = (tmp_path / "report.html").read_text()
+    assert "<svg" not in page
+    assert "fleetloc report" in page
+    assert "ticks on time" in page
 
 
 def test_lines_are_not_drawn_across_gaps() -> None:

@@ -8,6 +8,8 @@ holds are not in it.
 from __future__ import annotations
 
 from collections import Counter, defaultdict, deque
+from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -20,6 +22,7 @@ from estimators.integrity.finding import Finding
 from estimators.integrity.range_location import RangeLocation, RangeLocationMonitor
 from estimators.integrity.thresholds import RANGE_MEMORY_TICKS
 from estimators.model.gaussian import Prior
+from estimators.model.joint_ranges import SharedErrors, locate_jointly
 from estimators.model.layout import BodyKind
 from estimators.model.limits import target_limits
 from estimators.model.measurements import Matrix, Vector
@@ -34,14 +37,17 @@ from transport.messages.measurement_body import (
 
 MAX_RANGES = 48
 """More are thinned out: an attempt must fit into a tick."""
+MAX_TARGET_RANGES = 192
+"""The same of a target: far ahead of a fleet most is told by how ranges change over a minute."""
 MIN_RANGES = 4
 MOST_KEPT = 4096
 """Ranges kept of one body; the oldest go first."""
 CORRELATED = 4.0
 """On the covariance: the ranges share errors of the other drones' places, and the fit takes them for independent."""
 
-TARGET_SIGMA_M = 15.0
-"""A target less well known is not one of the state yet."""
+TARGET_SIGMA_M, BENT_M = 15.0, 1.0
+"""A target less well known is not one of the state yet; but one that is far away, if the sphere about a drone that a
+range leaves it bends by no more than `BENT_M` over its sigma."""
 WIDENED = 9.0
 """On the covariance of a target's place by ranges that the window holds as well."""
 STANDING_MPS = 3e-4
@@ -54,6 +60,8 @@ _Place = tuple[Vector, Matrix]
 """Mean ``(6,)`` and position covariance ``(3, 3)``."""
 _Known = dict[int, _Place]
 """By agent."""
+_Usable = tuple[RangeMeasurement | AnchorRangeMeasurement, int | Triple, _Place]
+"""A range, the agent or anchor at its other end, and where that was."""
 
 
 class RangeLocator:
@@ -68,7 +76,7 @@ class RangeLocator:
         self._motions = motions
         self._arms = LeverArms(config)
         self._known: dict[int, _Known] = {}
-        self._monitor, self._target_monitor = RangeLocationMonitor(), RangeLocationMonitor(TARGET_SIGMA_M)
+        self._monitor = RangeLocationMonitor()
         self._kinds = config.kinds
         self._target_limits = target_limits(config.estimator)
         self.findings: dict[int, tuple[Finding, ...]] = {}
@@ -108,7 +116,16 @@ class RangeLocator:
         if seen is not None:
             self.findings[target_id] = ()
             return seen
-        return self._taken(target_id, self._fit(target_id, at_tick, until_tick), self._target_monitor, WIDENED)
+        found = self._fit(target_id, at_tick, until_tick)
+        return self._taken(target_id, found, self._target_monitor(found), WIDENED)
+
+    def _target_monitor(self, place: Place | None) -> RangeLocationMonitor:
+        """It has to be known so well that its ranges can be linearised about where it is found."""
+        if place is None or not self._known:
+            return RangeLocationMonitor(TARGET_SIGMA_M)
+        latest = self._known[max(self._known)].values()
+        away_m = min((float(np.linalg.norm(place.mean[:3] - mean[:3])) for mean, _ in latest), default=0.0)
+        return RangeLocationMonitor(max(TARGET_SIGMA_M, float(np.sqrt(2.0 * away_m * BENT_M))))
 
     def _seen(self, target_id: int, at_tick: int, until_tick: int) -> Prior | None:
         """The prior of a target seen with its distance in one of the last ticks, from the latest of these."""
@@ -153,6 +170,28 @@ class RangeLocator:
 
     def _fit(self, agent_id: int, at_tick: int, until_tick: int) -> Place | None:
         """At ``at_tick``, by the ranges before ``until_tick``."""
+        usable = self._usable(agent_id, until_tick)
+        if len(usable) < MIN_RANGES or until_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
+            return None
+        ranges = self._range_set(agent_id, at_tick, usable)
+        ends = [other for _, other, _ in usable]
+        along_m2 = np.array([np.linalg.eigvalsh(covariance)[-1] for _, _, (_, covariance) in usable])
+        kind = self._kinds.get(agent_id)
+        if kind is None:
+            # an error that all ranges to a drone share does not average out over their number
+            count = Counter(ends)
+            shared_m2 = along_m2 * [count[other] for other in ends]
+            return multilaterate(replace(ranges, variance_m2=ranges.variance_m2 + shared_m2), VELOCITY_SIGMA_MPS)
+        known = {other: covariance for _, other, (_, covariance) in usable}
+        at = {other: place for place, other in enumerate(known)}
+        shared = SharedErrors(np.array([at[each] for each in ends]), np.array(list(known.values())), TARGET_BIAS_M**2)
+        # a drone's place is off by an error that lasts, and by one that does not
+        ranges = replace(ranges, variance_m2=ranges.variance_m2 + along_m2)
+        speed_mps = STANDING_MPS if kind is BodyKind.ANCHOR else VELOCITY_SIGMA_MPS
+        return locate_jointly(ranges, shared, speed_mps, self._target_limits)
+
+    def _usable(self, agent_id: int, until_tick: int) -> list[_Usable]:
+        """Its ranges before a tick whose other ends are known, the oldest first, thinned out."""
         usable = [
             (record, other, place)
             for record in self._ranges[agent_id]
@@ -161,18 +200,18 @@ class RangeLocator:
             and (place := self._place_of(record, other := _other_end(record, agent_id))) is not None
         ]
         usable.sort(key=lambda each: each[0].tick)
-        usable = usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
-        if len(usable) < MIN_RANGES or until_tick - usable[-1][0].tick > RANGE_MEMORY_TICKS:
-            return None
+        if agent_id not in self._kinds:
+            return usable[::-1][:: -(-len(usable) // MAX_RANGES) or 1][::-1]
+        if len(usable) <= MAX_TARGET_RANGES:
+            return usable
+        evenly = np.linspace(0.0, len(usable) - 1.0, MAX_TARGET_RANGES)
+        return [usable[each] for each in evenly.round().astype(int).tolist()]
+
+    def _range_set(self, agent_id: int, at_tick: int, usable: Sequence[_Usable]) -> RangeSet:
+        """Ranges of a drone or target relative to a tick; the variances are without those of their other ends."""
         moved, wandered = self._motions.before(agent_id, at_tick)
-        count: Counter[int | Triple] = Counter()
-        for _, other, _ in usable:
-            count[other] += 1
         anchors, leads, shifts, values, variances = [], [], [], [], []
-        kind = self._kinds.get(agent_id)
-        is_target = kind is not None
-        biased = TARGET_BIAS_M**2 if is_target else 0.0
-        for record, other, (mean, covariance) in usable:
+        for record, other, (mean, _) in usable:
             back = at_tick - record.tick
             shift = self._arms.shift(record) if isinstance(record, RangeMeasurement) else Shift()
             side = 1.0 if record.observer == other else -1.0
@@ -180,12 +219,8 @@ class RangeLocator:
             leads.append(record.offset_s - back * self._period_s)
             shifts.append(moved[abs(back)])  # of a target, which alone has ranges after the tick, nothing is told
             values.append(record.range_m)
-            # an error that all ranges to a drone share does not average out over their number
-            shared = count[other] * float(np.linalg.eigvalsh(covariance)[-1])
-            variances.append(record.variance_m2 + shift.variance_m2 + shared + wandered[abs(back)] + biased)
-        ranges = RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
-        speed_mps = STANDING_MPS if kind is BodyKind.ANCHOR else VELOCITY_SIGMA_MPS
-        return multilaterate(ranges, speed_mps, self._target_limits if is_target else None)
+            variances.append(record.variance_m2 + shift.variance_m2 + wandered[abs(back)])
+        return RangeSet(*(np.array(column) for column in (anchors, leads, shifts, values, variances)))
 
     def _place_of(self, record: RangeMeasurement | AnchorRangeMeasurement, other: int | Triple) -> _Place | None:
         """The other end of a range at its tick, if that is known."""

@@ -65,29 +65,29 @@ class Place:
         return self.cost <= MAX_COST_RATIO * max(self.surplus, 3)
 
 
-def multilaterate(
-    ranges: RangeSet, speed_sigma_mps: float, limits: tuple[Vector, Vector] | None = None
-) -> Place | None:
+def multilaterate(ranges: RangeSet, speed_sigma_mps: float) -> Place | None:
     """The place of least cost with all others that cost nearly as little; ``None`` without ranges.
-
-    ``limits``: lowest and highest state ``(6,)``; places beyond count for nothing, ``None`` where all are.
 
     ``speed_sigma_mps`` is the 1-sigma per axis of the velocity about zero. An unobservable place comes with the
     covariance that says so.
     """
     if not len(ranges.range_m):
         return None
+    states, costs = search(ranges, speed_sigma_mps)
+    information = _information(states[np.argmin(costs)], ranges, speed_sigma_mps)
+    return chosen(states, costs, information, len(ranges.range_m))
+
+
+def search(ranges: RangeSet, speed_sigma_mps: float) -> tuple[Matrix, Vector]:
+    """The minima ``(s, 6)`` of the cost, some of them several times, and their costs ``(s,)``."""
     states, costs = _descend(_starts(ranges), ranges, speed_sigma_mps)
-    mirrored = _mirrored(states, ranges.anchor_m)
-    more, more_costs = _descend(mirrored, ranges, speed_sigma_mps)
-    states, costs = np.concatenate((states, more)), np.concatenate((costs, more_costs))
-    if limits is not None:
-        within = ((states[:, :3] >= limits[0][:3]) & (states[:, :3] <= limits[1][:3])).all(axis=1)
-        if not within.any():
-            return None
-        states, costs = states[within], costs[within]
+    more, more_costs = _descend(_mirrored(states, ranges.anchor_m), ranges, speed_sigma_mps)
+    return np.concatenate((states, more)), np.concatenate((costs, more_costs))
+
+
+def chosen(states: Matrix, costs: Vector, information: Matrix, ranges: int) -> Place:
+    """The least of some minima ``(s, 6)``, where so many ``ranges`` have an ``information`` ``(6, 6)``."""
     best = int(np.argmin(costs))
-    information = _information(states[best], ranges, speed_sigma_mps)
     covariance = np.linalg.inv(information)
     away = states[:, :3] - states[best, :3]
     distance = np.einsum("si,ij,sj->s", away, np.linalg.inv(covariance[:3, :3]), away)
@@ -96,7 +96,7 @@ def multilaterate(
         mean=states[best],
         covariance=0.5 * (covariance + covariance.T),
         cost=float(costs[best]),
-        surplus=len(ranges.range_m) - 6,
+        surplus=ranges - 6,
         rivals=np.unique(np.round(states[rivals], 2), axis=0),
     )
 

@@ -10,8 +10,9 @@ import pytest
 from agent.config.reading import config_from
 from agent.config.tables import FleetConfig
 from agent.fleet.fix_tracks import FixTracks
-from agent.fleet.locating import RangeLocator
+from agent.fleet.locating import TARGET_BIAS_M, TARGET_SIGMA_M, RangeLocator
 from agent.fleet.motions import Motions
+from estimators.integrity.finding import What
 from transport.messages.measurement_body import (
     UNSEEN_VARIANCE,
     PositionMeasurement,
@@ -77,7 +78,11 @@ def test_the_prior_holds_a_ninth_of_what_the_ranges_say() -> None:
     information = 6 * rows.T @ rows / 0.25  # at least this much: the variances that it assumes are larger
     prior = np.linalg.inv(found[1][:3, :3])
     assert np.linalg.eigvalsh(information / 9.0 - prior).min() > 0.0
-    assert np.linalg.eigvalsh(prior - information / 90.0).min() > 0.0  # and it is no empty one
+    # and it is no empty one, whatever all ranges are too long by: seen from above that is like the target's height
+    with_bias = np.column_stack((rows, np.ones(len(rows))))
+    joint = 6 * with_bias.T @ with_bias / 0.25 + np.diag([0.0, 0.0, 0.0, 1.0 / TARGET_BIAS_M**2])
+    biased = np.linalg.inv(np.linalg.inv(joint)[:3, :3])
+    assert np.linalg.eigvalsh(prior - biased / 45.0).min() > 0.0
 
 
 @pytest.mark.parametrize("ahead", [0, 1, 2, 3])
@@ -115,6 +120,29 @@ def test_bearings_alone_locate_nothing() -> None:
         SightingMeasurement(1, 0, TARGET, 50.0, UNSEEN_VARIANCE, math.inf, 0.0, (0.0, 0.0, 1.0), 0.25)
     )
     assert locator.place_target(TARGET, at_tick=0, until_tick=1) is None
+
+
+@pytest.mark.parametrize(("ahead_m", "taken"), [(350.0, True), (600.0, False)])
+def test_a_target_far_away_may_be_known_worse_as_long_as_its_ranges_are_straight(ahead_m: float, taken: bool) -> None:
+    # GIVEN a fleet that is nearly level, and a few ranges of a metre to a target far ahead: its height is hardly told
+    fleet, rng = config("fixed"), np.random.default_rng(1)
+    locator, place = RangeLocator(fleet, Motions(fleet)), np.array((ahead_m, 30.0, 0.0))
+    places = DRONES_M * [1.0, 1.0, 0.1] - [0.0, 0.0, 36.0]
+    for tick in range(4):
+        locator.note_places(tick, {i: (np.array((*places[i - 1], 0, 0, 0)), 0.01 * np.eye(3)) for i in range(1, 6)})
+        for i in range(1, 6):
+            seen_m = float(np.linalg.norm(place - places[i - 1]) + rng.normal())
+            locator.note(RangeMeasurement(i, tick, TARGET, seen_m, 1.0))
+    # THEN it is taken where a sphere is flat over what is not known, and its ceiling holds
+    found = locator.place_target(TARGET, at_tick=0, until_tick=4)
+    assert (found is not None) == taken
+    assert [each.what for each in locator.findings[TARGET]] == ([] if taken else [What.UNCERTAIN])
+    if found is not None:
+        mean, covariance = found
+        assert mean[2] >= -5.0
+        error = mean[:3] - place
+        assert error @ np.linalg.solve(covariance[:3, :3], error) < 16.0
+        assert covariance[2, 2] > 9.0 * TARGET_SIGMA_M**2  # nine times as wide as what was found
 
 
 def test_without_enough_ranges_there_is_none() -> None:

@@ -24,6 +24,7 @@ from agent.mavlink.sample_adapter import SampleAdapter
 from agent.onboard import OnboardAgent
 from agent.sensing.frames import FleetFrame
 from agent.sensing.samples import AttitudeSample
+from sim_bridge.companions.target_camera import CameraDrivers, SensedDetections
 from sim_bridge.faults.member_faults import corrupt
 from sim_bridge.virtual.event_queue import EventQueue
 from sim_bridge.virtual.fleet_events import FleetEvents
@@ -113,7 +114,7 @@ class FleetLockstep:
         self._fixes = {i: self._fix_adapter() for i in config.ids}
         self._lives: Counter[int] = Counter()
         self._counters: dict[int, dict[str, int]] = {}
-        self._drivers = UwbDrivers()
+        self._drivers, self._cameras = UwbDrivers(), CameraDrivers()
         self.queue = EventQueue(self._start_s)
         self.fleet = VirtualFleet(
             config,
@@ -206,7 +207,7 @@ class FleetLockstep:
 
     def _step_feed(self, feed: SensorFeed) -> None:
         sensed = feed.step()
-        if sensed.samples or sensed.fixes or sensed.ranges:
+        if sensed.samples or sensed.fixes or sensed.ranges or sensed.detections:
             self._over_the_wire(functools.partial(self._on_sensed, sensed, self.queue.now_s))
 
     def _on_sensed(self, sensed: Sensed, taken_s: float) -> None:
@@ -224,6 +225,8 @@ class FleetLockstep:
                     agent.on_sample(fix, host_s)
         for measured in sensed.ranges:
             self._on_ranges(measured, taken_s)
+        for seen in sensed.detections:
+            self._on_detections(seen, taken_s)
 
     def _step_autopilots(self) -> None:
         """What an autopilot sends in one step travels as one datagram, as from the simulator's sockets."""
@@ -235,6 +238,8 @@ class FleetLockstep:
             self._to_agent(agent_id, data)
         for taken_s, measured in outputs.ranges:
             self._over_the_wire(functools.partial(self._on_ranges, measured, taken_s))
+        for taken_s, seen in outputs.detections:
+            self._over_the_wire(functools.partial(self._on_detections, seen, taken_s))
 
     def _to_agent(self, agent_id: int, data: bytes) -> None:
         for read in self._around.spoil(agent_id, data):
@@ -264,6 +269,11 @@ class FleetLockstep:
         else:
             frame = self._drivers.frame(taken_s, measured)
             drone.agent.on_uwb_frame(frame, self.queue.now_s - taken_s, self.queue.now_s)
+
+    def _on_detections(self, seen: SensedDetections, taken_s: float) -> None:
+        drone = self.fleet.drones.get(seen.observer)
+        if drone is not None:
+            drone.agent.on_uwb(self._cameras.payload(taken_s, seen), self.queue.now_s)
 
     def _over_the_wire(self, act: Callable[[], None]) -> None:
         self.queue.at(self.queue.now_s + WIRE_S + self._around.lateness_s(), act)

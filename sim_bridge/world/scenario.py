@@ -9,6 +9,7 @@ from typing import Literal
 
 from agent.sensing.frames import FleetFrame, normal_gravity_mps2
 from sim_bridge.autopilot.link_faults import LinkQuality
+from sim_bridge.companions.target_camera import CameraTable
 from sim_bridge.faults.fault_tables import FaultTable, about
 from sim_bridge.world.guidance import Path, Point, peak_accel_mps2
 from sim_bridge.world.noise import FlavourName, ProfileName
@@ -80,7 +81,9 @@ class Scenario:
     anchors: tuple[tuple[int, Point], ...] = ()
     """Ids and places, NED, of modules that all vehicles range."""
     targets: tuple[tuple[int, Path], ...] = ()
-    """Ids and paths of bodies that all vehicles range and that are no part of the fleet."""
+    """Ids and paths of bodies that are no part of the fleet."""
+    ranged_targets: bool = True
+    """Whether all vehicles range them."""
     gravity_mps2: float | None = None
     """Absent: normal gravity at the origin."""
     imu_hz: float = 100.0
@@ -95,6 +98,8 @@ class Scenario:
     """False: pairs have the bias of modules as delivered, 0.3 m on average."""
     odometry_hz: float = 0.0
     """Rate at which a camera of each vehicle tells its velocity; 0 = there are none."""
+    cameras: tuple[CameraTable, ...] = ()
+    """Of vehicles that detect targets."""
     gps_speed: Literal["horizontal", "norm"] = "horizontal"
     """What GPS_RAW_INT.vel holds: ground speed, as receivers have it, or the velocity's norm (the paper)."""
     fusing: bool = False
@@ -143,6 +148,7 @@ class Scenario:
                 )
         self._check_known("edges", (agent for edge in self.edges or () for agent in edge))
         self._check_known("gps_outages", (outage.agent for outage in self.gps_outages))
+        self._check_known("cameras", (camera.agent for camera in self.cameras))
         self._check_known("faults", (agent for fault in self.faults for agent in about(fault)))
         self._check_known("reboots", (reboot.agent for reboot in self.reboots))
         self._check_known("silences", (silence.agent for silence in self.silences))

@@ -28,6 +28,8 @@ def scenario_from_config(config: FleetConfig) -> Scenario:
         edges=config.fleet.edges,
         anchors=tuple(config.places_m.items()),
         targets=tuple((t.id, paths.get(t.id) or standing(slot)) for slot, t in enumerate(config.targets)),
+        ranged_targets=sim.ranged_targets,
+        cameras=sim.cameras,
         gravity_mps2=gravity_mps2(config),
         gps_hz=sim.gps_hz,
         uwb_hz=sim.uwb_hz,

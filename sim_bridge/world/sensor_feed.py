@@ -15,6 +15,7 @@ from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.samples import AttitudeSample, BaroSample, ImuSample, VelocitySample
 from sim_bridge.autopilot.mavlink_wire import gps_raw_int
 from sim_bridge.companions.camera import SIGMA_MPS
+from sim_bridge.companions.target_camera import SensedDetections
 from sim_bridge.world.sensors import SensedImu, SensedRanges, quaternion_of, vector_of
 from sim_bridge.world.simulation import Simulation
 from sim_bridge.world.truth import Truth, TruthRecorder
@@ -25,7 +26,7 @@ GRID_TOLERANCE = 1e-6
 
 @dataclass(slots=True)
 class Sensed:
-    """What left the sensors in one step: samples and GPS_RAW_INT messages by agent, and range sets.
+    """What left the sensors in one step: samples and GPS_RAW_INT messages by agent, range sets, detections.
 
     A fix stays a message since the agent makes its variances of what the receiver says.
     """
@@ -33,6 +34,7 @@ class Sensed:
     samples: list[tuple[int, ImuSample | AttitudeSample | BaroSample | VelocitySample]] = field(default_factory=list)
     fixes: list[tuple[int, Any]] = field(default_factory=list)
     ranges: list[SensedRanges] = field(default_factory=list)
+    detections: list[SensedDetections] = field(default_factory=list)
 
 
 class _StepGrid:
@@ -77,7 +79,7 @@ class SensorFeed:
         world.step()
         if world.step_index % self._truth_every == 0:
             self._record()
-        sensed = Sensed(ranges=sensors.ranges())
+        sensed = Sensed(ranges=sensors.ranges(), detections=self._simulation.detections())
         t_s = self._start_fleet_s + world.time_s
         imu_due, attitude_due = self._imu.due(world.step_index), self._attitude.due(world.step_index)
         pressure_due = imu_due and self._pressure.due(world.step_index)

@@ -479,11 +479,9 @@ class FleetSensors:
         return measured
 
     def _places_of_others(self) -> list[tuple[int, Array]]:
-        """Ids and places ``(3,)`` NED of the anchors and, now, of the targets."""
-        scenario = self._scenario
-        places_m, _ = moved_along([path for _, path in scenario.targets], self._world.time_s)
-        still = [(anchor, np.array(place_m)) for anchor, place_m in scenario.anchors]
-        return still + list(zip((target for target, _ in scenario.targets), places_m, strict=True))
+        """Ids and places ``(3,)`` NED of what carries a module: the anchors and, now, targets."""
+        still = [(anchor, np.array(place_m)) for anchor, place_m in self._scenario.anchors]
+        return still + (targets_at(self._scenario, self._world.time_s) if self._scenario.ranged_targets else [])
 
     def _range(self, slot: int, target: int, between: Array) -> SensedRange | None:
         """What a vehicle's module measures of a body that is ``between`` ``(3,)`` NED away, if it is in reach."""
@@ -511,3 +509,9 @@ class FleetSensors:
         if not arm.any():
             return np.asarray(position)
         return np.asarray(position + quaternions.rotate(self._world.attitude()[slot][None], arm[None])[0])
+
+
+def targets_at(scenario: Scenario, time_s: float) -> list[tuple[int, Array]]:
+    """Ids and places ``(3,)`` NED of the targets at a time since the start."""
+    places_m, _ = moved_along([path for _, path in scenario.targets], time_s)
+    return list(zip((target for target, _ in scenario.targets), places_m, strict=True))

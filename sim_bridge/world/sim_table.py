@@ -12,6 +12,7 @@ from agent.config.faults import Fault
 from agent.config.fields import AgentId, NotNegative, Point, Positive, Seed, Table
 from agent.config.reading import OtherTable
 from agent.config.tables import FleetConfig
+from sim_bridge.companions.target_camera import CameraTable
 from sim_bridge.faults.fault_tables import FaultTable, wrong_settings
 
 
@@ -104,6 +105,8 @@ class SimTable(Table, frozen=True):
     """Rate at which every pair ranges."""
     odometry_hz: Annotated[float, msgspec.Meta(ge=0, le=100)] = 0.0
     """Rate at which a camera of each drone tells its velocity (ODOMETRY of a companion); 0 = there are none."""
+    ranged_targets: bool = True
+    """Whether targets carry a UWB module, which all drones range."""
     uwb_module: Literal["none", "linktrack", "uci", "dwm1001", "dwm3001-cli"] = "none"
     """What measures the ranges of a live fleet: modules simulated down to their bytes, on pseudo terminals behind
     `fleetloc uwb`; or, with none, the simulator's own driver, which sends frames."""
@@ -116,6 +119,8 @@ class SimTable(Table, frozen=True):
     """When which receivers see nothing."""
     faults: tuple[FaultTable, ...] = ()
     """What goes wrong with which drones when."""
+    cameras: tuple[CameraTable, ...] = ()
+    """Which drones have cameras that detect targets."""
     paths: tuple[PathTable, ...] = ()
     """One per drone or target. A drone without one hovers; a target without one stands still on the ground."""
 
@@ -126,6 +131,10 @@ def _faults(table: SimTable, config: FleetConfig) -> Iterator[Fault]:
         yield from unknown_ids(config, f"{key}.agent", (outage.agent,))
         if outage.to_s <= outage.from_s:
             yield Fault(f"{key}.to_s", f"later than from_s = {outage.from_s:g}", f"{outage.to_s:g}")
+    for index, camera in enumerate(table.cameras):
+        yield from unknown_ids(config, f"sim.cameras[{index}].agent", (camera.agent,))
+        if camera.agent in {other.agent for other in table.cameras[:index]}:
+            yield Fault(f"sim.cameras[{index}].agent", "one camera per drone", f"a second one of {camera.agent}")
     yield from wrong_settings(table.faults, config, "sim.faults")
     if table.uwb_module != "none" and any(len(agent.uwb_tags_m) > 1 for agent in config.agents):
         yield Fault("sim.uwb_module", '"none" where a drone has several UWB tags', f'"{table.uwb_module}"')

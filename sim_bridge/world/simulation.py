@@ -18,11 +18,12 @@ from sim_bridge.autopilot.fake_autopilot import AutopilotSetup, FakeAutopilot
 from sim_bridge.autopilot.link_faults import FaultyLink
 from sim_bridge.autopilot.truth_messages import TrueState
 from sim_bridge.companions.camera import Camera, Companion
+from sim_bridge.companions.target_camera import SensedDetections, TargetCamera
 from sim_bridge.world import quaternions
 from sim_bridge.world.guidance import Waypoints, default_path, moved_along
 from sim_bridge.world.quaternions import Array
 from sim_bridge.world.scenario import Reboot, Scenario
-from sim_bridge.world.sensors import FleetSensors, SensedAttitude, SensedImu, SensedRanges
+from sim_bridge.world.sensors import FleetSensors, SensedAttitude, SensedImu, SensedRanges, targets_at
 from sim_bridge.world.truth import Truth, TruthRecorder
 from sim_bridge.world.world import Dynamics, FleetWorld
 
@@ -38,10 +39,14 @@ ATTITUDE_MESSAGES = (mavlink.MAVLINK_MSG_ID_ATTITUDE, mavlink.MAVLINK_MSG_ID_ATT
 
 @dataclass(slots=True)
 class Outputs:
-    """What left the simulated fleet: frames by agent, ranges with their time on the clock of ``now``."""
+    """What left the simulated fleet: frames by agent, ranges and detections and when they were taken.
+
+    Times are on the clock of ``now``.
+    """
 
     frames: list[tuple[int, bytes]] = field(default_factory=list)
     ranges: list[tuple[float, SensedRanges]] = field(default_factory=list)
+    detections: list[tuple[float, SensedDetections]] = field(default_factory=list)
 
 
 class SimulatedVehicle:
@@ -133,6 +138,7 @@ class Simulation:
             for slot, vehicle in enumerate(scenario.vehicles)
         }
         self.companions = companions(scenario)
+        self._cameras = _cameras(scenario)
         self.dropped: Counter[int] = Counter()
         """Frames lost on a silenced link, by agent."""
         links = np.random.SeedSequence((scenario.seed, 2)).spawn(2 * len(scenario.ids))
@@ -207,6 +213,19 @@ class Simulation:
         if self.scenario.fusing:
             self._fly_by_belief()
         outputs.ranges += [(now, ranges) for ranges in self.sensors.ranges()]
+        outputs.detections += [(now, seen) for seen in self.detections()]
+
+    def detections(self) -> list[SensedDetections]:
+        """What the cameras see of the targets at this step; ask once after each."""
+        if not self._cameras:
+            return []
+        scenario, world = self.scenario, self.world
+        targets, attitudes = targets_at(scenario, world.time_s), world.attitude()
+        seen = []
+        for camera in self._cameras:
+            slot = scenario.slot(camera.agent)
+            seen.append(camera.look(world.time_s, world.position_m[slot], attitudes[slot], targets))
+        return [each for each in seen if each is not None]
 
     def _fly_by_belief(self) -> None:
         """Vehicles are guided by where their autopilots believe to be, once they believe anything."""
@@ -288,4 +307,12 @@ def companions(scenario: Scenario) -> list[Companion]:
     return [
         Companion(vehicle.system_id, Camera(scenario.odometry_hz, np.random.default_rng(seed)))
         for vehicle, seed in zip(scenario.vehicles, seeds, strict=True)
+    ]
+
+
+def _cameras(scenario: Scenario) -> list[TargetCamera]:
+    """The cameras that detect targets, each with noise of its own."""
+    seeds = np.random.SeedSequence((scenario.seed, 4)).spawn(len(scenario.ids))
+    return [
+        TargetCamera(camera, np.random.default_rng(seeds[scenario.slot(camera.agent)])) for camera in scenario.cameras
     ]

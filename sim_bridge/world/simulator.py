@@ -15,6 +15,7 @@ from agent.config.endpoints import Endpoint, parse_endpoint
 from agent.config.tables import FleetConfig
 from agent.radio.security import simulated_mavlink_keys
 from sim_bridge.autopilot.udp_autopilot import AutopilotPort, open_port
+from sim_bridge.companions.target_camera import CameraDrivers
 from sim_bridge.uwb_modules.terminals import SimulatedModules
 from sim_bridge.world.range_sessions import open_range_sessions
 from sim_bridge.world.scenario import Scenario
@@ -30,7 +31,7 @@ LATE_S = 0.1
 STOP_SIGNALS = (signal.SIGTERM, signal.SIGINT)
 
 PublishRanges = Callable[[int, bytes], bool]
-"""(observer, ``uwb-range/1`` payload) -> whether it was taken."""
+"""(observer, ``uwb-range/1`` or ``target-detection/1`` payload) -> whether it was taken."""
 
 OnAdvance = Callable[[Simulation], None]
 """Called whenever the world has moved, e.g. to show it."""
@@ -69,7 +70,7 @@ class Simulator:
         self._on_advance = on_advance
         self.ports: dict[int, AutopilotPort] = {}
         self._publish_ranges, self._modules = publish_ranges, modules
-        self._drivers = UwbDrivers()
+        self._drivers, self._cameras = UwbDrivers(), CameraDrivers()
         self._published = 0
         self._failed = 0
         self._max_behind_s = 0.0
@@ -129,6 +130,8 @@ class Simulator:
                 taken = self._publish_ranges(ranges.observer, self._drivers.payload(taken_s, ranges))
             self._published += taken
             self._failed += not taken
+        for taken_s, seen in outputs.detections:
+            self._failed += not self._publish_ranges(seen.observer, self._cameras.payload(taken_s, seen))
 
     def report(self) -> SimulatorReport:
         """How it went so far."""

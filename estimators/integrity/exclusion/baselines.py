@@ -14,6 +14,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from estimators.integrity.thresholds import SCATTERED
 from estimators.model.measurements import Kind, RowTable, Vector
 
 BIN_S = 0.25
@@ -85,6 +86,11 @@ class Ranging:
     stuck: bool
     """Whether they repeat to the last digit."""
 
+    @property
+    def impossible(self) -> bool:
+        """Whether they cannot be right, wherever the drones are."""
+        return self.stuck or self.ends_apart > SCATTERED
+
     def is_spoiled(self, limit: float) -> bool:
         """Whether they are off, with that many sigmas as the limit."""
         return self.stuck or max(self.scatter, self.ends_apart) > limit
@@ -116,7 +122,8 @@ class Bin:
     fix_variance_m2: Mapping[int, Vector]
     """``(3,)`` of the mean of a drone's fixes, as claimed."""
     unheld: Mapping[Pair, Ranging]
-    """Of pairs that range, and of which an end has had no fixes for a while, so that nothing can be left over."""
+    """Of pairs that range and of which nothing can be left over: an end has had no fixes for a while, or both are
+    near."""
 
     def without(self, agents: Container[int]) -> Bin:
         """The same without the pairs of some drones."""
@@ -325,9 +332,7 @@ class Baselines:
                 continue
             if not -WAIT_S <= now_s - t_s <= WAIT_S:
                 if now_s > t_s:
-                    self._unheld[pair] = max(int(t_s // BIN_S), self._unheld.get(pair, 0))
-                    # which way the antennas' lever arms point is not known: they may be all of what it is off
-                    self._hear_ranging(each, each.range_m, float(np.linalg.norm(each.arms_m)))
+                    self._hear_unheld(each)
                 continue
             one, other = (self._fixes[agent].at(t_s) for agent in pair)
             if one is None or other is None:
@@ -339,7 +344,15 @@ class Baselines:
                 held = self._open.setdefault(int(t_s // BIN_S), {}).setdefault(pair, [])
                 held.append((each.range_m - distance, apart, each.variance_m2))
                 self._hear_ranging(each, each.range_m - float(apart @ each.arms_m) / distance)
+            elif max(distance, each.range_m) < FARTHEST_M:
+                self._hear_unheld(each)
         self._waiting = still
+
+    def _hear_unheld(self, each: _Waiting) -> None:
+        """A range that cannot be held against fixes: there are none, or they do not tell the direction."""
+        self._unheld[each.pair] = max(int(each.t_s // BIN_S), self._unheld.get(each.pair, 0))
+        # which way the antennas' lever arms point is not known: they may be all of what it is off
+        self._hear_ranging(each, each.range_m, float(np.linalg.norm(each.arms_m)))
 
     def _hear_ranging(self, each: _Waiting, between_m: float, arm_m: float = 0.0) -> None:
         """A range for what the pair's ranges say of themselves, between the bodies as well as that is known."""

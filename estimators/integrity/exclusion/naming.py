@@ -153,9 +153,10 @@ class NamingMonitor:
         known = [(pair, each) for pair, each in closed.pairs.items() if not self._is_doubted(pair)]
         hidden = {agent for agent in self._slow.agents if self._is_hidden(agent, closed)}
         limits = {pair: usual * (AGREEING_SCATTER if hidden & set(pair) else SCATTERED) for pair, _ in known}
-        found = {pair: each for pair, each in known if each.ranging.is_spoiled(limits[pair])}
-        for pair, each in found.items():
-            self.ranges_off[pair] = Named(tick, NAMED_NATS, np.array([each.residual_m]))
+        found = {pair: each.residual_m for pair, each in known if each.ranging.is_spoiled(limits[pair])}
+        unheld = [pair for pair, each in closed.unheld.items() if each.impossible and pair not in self.ranges_off]
+        for pair, residual_m in (found | dict.fromkeys(unheld, 0.0)).items():
+            self.ranges_off[pair] = Named(tick, NAMED_NATS, np.array([residual_m]))
         if found and not self._begin_again(SCATTERED_S, but_last=True):
             self._restart_odds()
 

@@ -27,7 +27,7 @@ from estimators.model.measurements import Kind, Matrix, RowTable, Vector
 
 LATE_TICKS = 16
 """Rows older than this are left out."""
-REPEATED_S = 0.5
+REPEATED_S = 0.15
 """What is found of a neighbour again after so long is no single outlier, and stands until it has agreed for a while:
 a bound that is broken for good, as by a bias, shows only now and then, when the errors of both sensors add up."""
 

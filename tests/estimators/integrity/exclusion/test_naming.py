@@ -234,6 +234,19 @@ def test_what_one_end_of_a_pair_measures_otherwise_than_the_other_is_off_in_any_
     assert 15.0 <= named_after_s[-1] <= 19.0
 
 
+def test_ranges_that_cannot_be_right_are_named_without_fixes_and_between_drones_side_by_side() -> None:
+    monitor, named_after_s = NamingMonitor(1, PERIOD_S), list[float]()
+    for tick, rows in rows_of_flight(5, 2, 24.0):
+        blind = (rows["kind"] == Kind.POSITION) & (rows["agent"] == 4) & (tick > 50)
+        rows["value"][between(rows, 0, 1)] = 2.0 + 0.01 * tick if tick < 200 else 3.0  # stuck, within 4 m
+        rows["value"][between(rows, 3, 4)] = rows["value"][between(rows, 3, 4)] if tick < 200 else 9.0
+        monitor.observe(SharedTick(tick, (1, 2, 3, 4, 5), rows[~blind]))
+        assert set(monitor.ranges_off) <= {(1, 2), (4, 5)}
+        named_after_s += [tick * PERIOD_S - 20.0] if len(monitor.ranges_off) == 2 else []
+    assert monitor.named == {}
+    assert 0.0 < named_after_s[0] <= 4.0
+
+
 def test_ranges_to_a_drone_that_has_lost_its_fixes_count_again() -> None:
     # nothing can be held against them any more, and that drone has nothing else
     rng = np.random.default_rng(2)

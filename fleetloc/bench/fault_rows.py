@@ -61,7 +61,10 @@ class FaultRow(Table, frozen=True):
     """Fleets with fewer drones leave the row out."""
     attributable_from: int = 1
     """Fleets with fewer drones cannot tell whose fault it is, or have too few ranges to hold a drone without its
-    receiver. They are held to what they say in time, to sigmas where no alarm stands, and not to the ratio."""
+    receiver: they are held to `told_within_s` and not to the ratio."""
+    told_within_s: float = 3.0
+    """Bound of the time to a flag of a drone that is hit, in those fleets; from then on the sigmas count, where no
+    alarm stands."""
     ratio_at_most: float | None = None
     """Bound of the fleet's position RMSE while it lasts, over that of the same seeds without it; absent = none."""
     sigmas_at_most: float = 3.0

@@ -91,6 +91,8 @@ def row_figures(row: FaultRow, flown: Pooled) -> Figures:
     for name, span in zip(SPANS, (before, during, after), strict=True):
         figures[name] = _span_figures(flown, span, hit, others)
     figures |= _honesty(flown, since, during, hit)
+    told = ticks[1] + round(row.told_within_s / flown.period_s)
+    figures["sigmas_p99_unalarmed"] = _unalarmed_sigmas(flown, slice(told, ticks[3]))
     figures["back_after_s"] = back_after_s(flown, ticks[2], ticks[3])
     figures["flagged_after_s"] = _flagged_after_s(flown, during, hit)
     figures["attributable"] = len(flown.ids) >= row.attributable_from
@@ -124,7 +126,6 @@ def _honesty(flown: Pooled, since: slice, during: slice, hit: Sequence[int]) -> 
     claimed, actual = _rms(stacked("sigma_m", during, hit)), _rms(stacked("error_m", during, hit))
     return {
         "sigmas_p99": _over(lambda values: np.percentile(values, P99), error / sigma),
-        "sigmas_p99_unalarmed": _over(lambda values: np.percentile(values, P99), (error / sigma)[~alarm]),
         "anees_own": _over(np.mean, stacked("nees")),
         "anees_own_hit": _over(np.mean, stacked("nees", slots=hit)),
         "anees_fleet": _over(np.mean, stacked("nees_fleet")),
@@ -135,6 +136,14 @@ def _honesty(flown: Pooled, since: slice, during: slice, hit: Sequence[int]) -> 
         "misleading_share": float(misled.mean()),
         "misleading_without_alarm_share": float((misled & ~alarm).mean()),
     }
+
+
+def _unalarmed_sigmas(flown: Pooled, span: slice) -> float:
+    """Errors over sigmas of a part of the flights that 99 % of the epochs without an alarm keep."""
+    error, sigma, alarm = (
+        flown.stacked(flown.faulty, name, span, range(len(flown.ids))) for name in ("error_m", "sigma_m", "alarm")
+    )
+    return _over(lambda values: np.percentile(values, P99), (error / sigma)[~alarm])
 
 
 def back_after_s(flown: Pooled, end: int, last: int) -> float | None:
@@ -162,10 +171,11 @@ def misses(row: FaultRow, figures: Figures) -> list[str]:
 
     Where nobody can tell whose fault it is, an estimate is pulled along, and an alarm has to say so.
     """
-    ratio, sigmas, ratio_at_most = figures["during"]["position_ratio_all"], figures["sigmas_p99"], row.ratio_at_most
+    ratio, sigmas = figures["during"]["position_ratio_all"], figures["sigmas_p99"]
+    ratio_at_most, told_within_s = row.ratio_at_most, None
     if not figures["attributable"]:
         unalarmed = figures["sigmas_p99_unalarmed"]
-        ratio_at_most, sigmas = None, 0.0 if math.isnan(unalarmed) else unalarmed
+        ratio_at_most, told_within_s, sigmas = None, row.told_within_s, 0.0 if math.isnan(unalarmed) else unalarmed
     back_s, flag_s = (
         math.inf if figures[name] is None else figures[name] for name in ("back_after_s", "flagged_after_s")
     )
@@ -174,6 +184,7 @@ def misses(row: FaultRow, figures: Figures) -> list[str]:
         ("sigmas", sigmas, row.sigmas_at_most),
         ("back s", back_s, row.back_within_s),
         ("flag s", flag_s, row.flag_within_s),
+        ("told s", flag_s, told_within_s),
         ("claim", figures["claimed_over_actual_hit"], row.claim_at_most),
     )
     found = [

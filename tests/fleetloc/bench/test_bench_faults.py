@@ -201,7 +201,7 @@ def test_what_the_drones_say_of_it() -> None:
 
 
 def test_fleets_too_small_to_tell_whose_fault_it_is_are_held_to_what_they_say_of_it() -> None:
-    of_few = msgspec.structs.replace(ROW, attributable_from=3, flag_within_s=0.5)
+    of_few = msgspec.structs.replace(ROW, attributable_from=3, told_within_s=0.5)
     silent = row_figures(of_few, pooled(faulted()))
     assert not silent["attributable"]
     assert silent["misses"] == ["sigmas 40 > 3", "misleads"]
@@ -211,8 +211,16 @@ def test_fleets_too_small_to_tell_whose_fault_it_is_are_held_to_what_they_say_of
     assert told["sigmas_p99"] == pytest.approx(40.0)
     assert told["sigmas_p99_unalarmed"] == pytest.approx(4.0)  # after it, when the alarm is gone
     assert told["misses"] == ["sigmas 4 > 3"]
-    late = row_figures(msgspec.structs.replace(of_few, flag_within_s=0.4), pooled(faulted()))
-    assert "flag s 0.5 > 0.4" in late["misses"]
+    # until it has to be told nobody can know
+    alarm[:45] = False
+    error = faulted().error_m.copy()
+    error[60:] = 0.2
+    late = row_figures(of_few, pooled(history_with(faulted(), alarm=alarm, error_m=error)))
+    assert late["misses"] == ["misleads"]
+    prompt = row_figures(
+        msgspec.structs.replace(of_few, told_within_s=0.4), pooled(history_with(faulted(), alarm=alarm))
+    )
+    assert "told s 0.5 > 0.4" in prompt["misses"]
     # a fleet that can tell is held to all
     assert (
         "ratio 14.2 > 2"

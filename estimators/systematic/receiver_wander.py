@@ -26,6 +26,8 @@ WANDERS_M = np.array([0.02, 0.15, 0.4, 0.8, 1.6, 4.0])
 """Standard deviations of the wander per axis."""
 PRIOR = np.array([0.32, 0.25, 0.2, 0.14, 0.07, 0.02])
 """Probability of each before any evidence."""
+EXPECTED_M2 = float(PRIOR @ WANDERS_M**2)
+"""Mean square of the wander before any evidence."""
 WHITES = np.array([0.35, 0.6, 1.0, 2.0])
 """What the white noise of the fixes is, of what the receiver claims."""
 HYPOTHESES_M, FACTORS = np.tile(WANDERS_M, len(WHITES)), np.repeat(WHITES, len(WANDERS_M))
@@ -36,11 +38,13 @@ MEMORY_FIXES = 300.0
 TRUST_NATS = 2.0
 """Log odds that a receiver whose white noise is all that it claims does not wander, once it has been watched."""
 WATCHED_FIXES = 40.0
-"""So many fixes tell a wander: of fewer, any is as likely as another."""
+"""So many fixes tell a wander: of fewer, any is as likely as another. Until then none is taken for smaller than was
+expected: a place that is believed since a wander was taken for small is believed for long."""
 CLAIM_SHARE = 0.05
 """Of a new fix in the average of what a receiver claims."""
-VERTICAL = 1.0, 2.5
-"""The vertical wander, which no velocity tells, against the horizontal one: receivers see half a sky."""
+VERTICAL = 1.5, 2.5
+"""The vertical wander, which no velocity tells, against the horizontal one, at least and at most: receivers see half
+a sky."""
 OUTLIER_SQUARE = 25.0
 """A normalised innovation beyond this says nothing of a wander."""
 MOST_OUTLIERS = 15
@@ -113,7 +117,7 @@ def _tell(nats: Matrix, fixes: IntArray, claims: Matrix, sizes: Matrix, factors:
                 total += weight
                 wander += weight * HYPOTHESES_M[h] ** 2
                 white += weight * FACTORS[h] ** 2
-            size[a, group] = np.sqrt(wander / total)
+            size[a, group] = np.sqrt(max(wander / total, (1.0 - watched) * EXPECTED_M2))
             unused[a, group] = claims[a, group] * np.sqrt(max(1.0 - white / total, 0.0))
             for axis in range(2 * group, 2 + group):
                 factors[a, axis] = np.sqrt(white / total)

@@ -3,7 +3,7 @@
 Tick k holds the instants from ``k T`` to ``(k+1) T`` of fleet time. The IMU is rotated to NED with the
 attitude at its own time, gravity is removed, and the acceleration is integrated over the tick (linear
 between samples). Silence longer than the configured gap is not bridged: the mean of the rest stands in for
-it, with a variance that says so. So does the variance of a tick in which the acceleration jumps.
+it, with a variance that says so.
 """
 
 from __future__ import annotations
@@ -29,9 +29,6 @@ ACCEL_GAP_SIGMA_MPS2 = 1.1547
 """1-sigma of the acceleration while no IMU sample came: uniform in +-2 m/s2, as of other drones by default."""
 ATTITUDE_MAX_AGE_S = 0.3
 """An IMU sample without an attitude this close is a gap: carried further with the turn rate, tilt errors show."""
-JUMP_MPS2 = 15.0
-"""Samples in a row that differ by more: no manoeuvre turns or pushes a drone so fast, it has hit something. What the
-acceleration was in between, nobody knows: anything from the one to the other."""
 PINNED_SAMPLES = 6
 """So many samples in a row with one and the same large component: the accelerometer is at its limit, or hangs."""
 NOISE_STEPS = 5.0
@@ -169,7 +166,7 @@ class Timeline:
         accelerations = self._accelerations(start_s, end_s)
         self._judge(accelerations, start_s, end_s)
         points = [(t, a) for t, a in accelerations if a is not None]
-        covered_s, integral, missed_mps = self._integral(points, start_s, end_s)
+        covered_s, integral = self._integral(points, start_s, end_s)
         self._closed_until_s = end_s
         self._forget(start_s - KEEP_S)
         inside = len([t for t, _ in points if start_s <= t < end_s])
@@ -181,7 +178,6 @@ class Timeline:
         aided = all(sample.aided for sample in self._attitudes if start_s <= sample.t_s < end_s)
         tilted = 0.0 if aided else TILTED_MPS2**2
         variance = self._sensors.accel_sigma_mps2**2 + (uncovered * ACCEL_GAP_SIGMA_MPS2) ** 2 + tilted
-        variance += (missed_mps / covered_s) ** 2
         north, east, down = (component / covered_s for component in integral)
         return TickInput(tick, (north, east, down), (variance, variance, variance), coverage, inside, aided)
 
@@ -246,14 +242,12 @@ class Timeline:
         north, east, down = rotated(attitude, sample.specific_force_mps2)
         return north, east, down + self._gravity_mps2
 
-    def _integral(
-        self, points: list[tuple[float, Triple]], start_s: float, end_s: float
-    ) -> tuple[float, Triple, float]:
-        """Covered time in s, integral in m/s over a tick, and its 1-sigma per axis, m/s, by jumps."""
+    def _integral(self, points: list[tuple[float, Triple]], start_s: float, end_s: float) -> tuple[float, Triple]:
+        """Covered time in s and integral in m/s over a tick."""
         gap_s = self._sensors.imu_max_gap_s
-        covered_s, north, east, down, missed_mps = 0.0, 0.0, 0.0, 0.0, 0.0
+        covered_s, north, east, down = 0.0, 0.0, 0.0, 0.0
         if not points:
-            return covered_s, (north, east, down), missed_mps
+            return covered_s, (north, east, down)
         # Before the first and after the last sample the nearest one holds, for as long as a gap may be.
         held = [(points[0][0] - gap_s, points[0][1]), *points, (points[-1][0] + gap_s, points[-1][1])]
         for (t0, a0), (t1, a1) in pairwise(held):
@@ -266,10 +260,7 @@ class Timeline:
             north += part_s * (a0[0] + middle * (a1[0] - a0[0]))
             east += part_s * (a0[1] + middle * (a1[1] - a0[1]))
             down += part_s * (a0[2] + middle * (a1[2] - a0[2]))
-            jump = math.dist(a0, a1)
-            if jump > JUMP_MPS2:
-                missed_mps = math.hypot(missed_mps, part_s * jump / math.sqrt(12.0))
-        return covered_s, (north, east, down), missed_mps
+        return covered_s, (north, east, down)
 
     def _forget(self, before_s: float) -> None:
         del self._imu[: bisect_left(self._imu, before_s, key=_time_of)]

@@ -210,24 +210,6 @@ def test_consecutive_ticks_share_no_time_and_miss_none() -> None:
     assert velocity == pytest.approx(expected, abs=2e-3)
 
 
-@pytest.mark.parametrize("hit", [2, 7, 9])
-def test_a_blow_that_one_sample_saw_may_have_been_twice_as_long_or_none(hit: int) -> None:
-    # GIVEN a sample of 300 m/s2 among calm ones, every 10 ms
-    made = timeline()
-    for i in range(-1, 32):
-        accel = (0.0, 300.0, 0.0) if i == hit else (0.0, 0.0, 0.0)
-        made.add_imu(ImuSample(0.01 * i, force((1, 0, 0, 0), accel), (0, 0, 0)))
-        made.add_attitude(AttitudeSample(0.01 * i, (1, 0, 0, 0)))
-    first, later = made.close(0), made.close(1)
-    # THEN the velocity that it stands for is told, and to a third of it not known, along all axes
-    assert 0.1 * (first.accel_mps2[1] + later.accel_mps2[1]) == pytest.approx(3.0)
-    for axis in range(3):
-        sigma_mps = 0.1 * math.sqrt(first.variance[axis] + later.variance[axis])
-        assert 1.0 < sigma_mps < 3.0
-    # and ticks without a part of it are as sure as ever
-    assert made.close(2).variance == pytest.approx((0.01,) * 3)
-
-
 def test_an_attitude_without_aiding_is_taken_for_tilted_at_once() -> None:
     made = timeline()
     fill(made, 0.0, 0.25)

@@ -74,13 +74,21 @@ class NamingMonitor:
         """Receivers that are off, by id."""
         self.ranges_off: dict[Pair, Named] = {}
         """Ranges that are off."""
-        self.unattributable_nats = 0.0
-        """Odds of somebody being off where it cannot be told who; 0: nobody, or it can."""
+        self._somebody: Named | None = None
+        """Somebody, it cannot be told who."""
         self.separation_m: Vector = np.zeros(3)
         """``(3,)``, per axis: how far the own place moves at most if a receiver or ranges that do not agree are left
         out."""
         self.receivers = 0
         """Receivers not named that are ranged to."""
+
+    @property
+    def unattributable_nats(self) -> float:
+        """Odds of somebody being off where it cannot be told who; 0: nobody, or it can.
+
+        While they begin to agree again, those from which on they do not.
+        """
+        return 0.0 if self._somebody is None else max(self._somebody.odds_nats, AGREEING_NATS)
 
     def observe(self, evidence: SharedTick) -> tuple[Finding, ...]:
         """A finding about each receiver and pair that is off; one about nobody where it is not told whose."""
@@ -103,6 +111,7 @@ class NamingMonitor:
         self._slow.keep(agents)
         self._restart_odds()
         self._before.clear()
+        self._somebody = None
         self.named = {agent: each for agent, each in self.named.items() if agent in agents}
         self.ranges_off = {pair: each for pair, each in self.ranges_off.items() if set(pair) <= set(agents)}
 
@@ -113,11 +122,14 @@ class NamingMonitor:
         there = [pair for pair in closed.pairs if all(agent in closed.fix_variance_m2 for agent in pair)]
         chosen = self._chosen(closed)
         if chosen:
-            fresh, now = self._learn(closed, chosen)
             self.receivers = len({agent for pair in chosen for agent in pair})
-            self._note_jumps(fresh, now)
-            self.separation_m = self._separation(now)
-            self._judge(now, tick)
+            if self._somebody is not None and self.receivers < FEWEST_RECEIVERS:
+                self._reconsider_somebody(self._somebody, closed, chosen)
+            else:
+                fresh, now = self._learn(closed, chosen)
+                self._note_jumps(fresh, now)
+                self.separation_m = self._separation(now)
+                self._judge(now, tick)
         for agent in list(self.named):
             mine = sorted(pair for pair in there if agent in pair and not self._is_doubted(pair, but=agent))
             self._reconsider_receiver(agent, closed, mine)
@@ -199,7 +211,7 @@ class NamingMonitor:
         return pair in self.ranges_off or any(agent in self.named for agent in pair if agent != but)
 
     def _judge(self, now: Odds, tick: int) -> None:
-        self.unattributable_nats = 0.0
+        self._somebody = None
         ranked: list[tuple[int | tuple[Pair, ...], LikelyFault]] = [*now.receivers.items(), *now.ranges.items()]
         if not ranked:
             return
@@ -207,7 +219,8 @@ class NamingMonitor:
         if fault.nats <= NAMED_NATS:
             return
         if self.receivers < FEWEST_RECEIVERS:
-            self.unattributable_nats = fault.nats
+            self._somebody = Named(tick, fault.nats, fault.shift_m)
+            self._go_back(fault)
             return
         rival_nats = max((each.nats for other, each in ranked if not _holds(other, whose)), default=0.0)
         if fault.nats - rival_nats > LEADING_NATS:
@@ -232,6 +245,17 @@ class NamingMonitor:
         if not self._begin_again(fault.age_s):
             self._slow.correct(fault.effect, fault.error, fault.covariance)
             self._restart_odds()
+
+    def _go_back(self, fault: LikelyFault) -> None:
+        """Know what was known before a fault of nobody knows whom, lest it be learnt."""
+        back = round(fault.age_s / BIN_S) + BINS_BEFORE
+        if back > len(self._before):
+            self._slow.correct(fault.effect, fault.error, fault.covariance)
+        else:
+            _, self._slow.state, self._slow.covariance = self._before[-back]
+            self._slow.pass_by(self._before[-1][0].number - self._before[-back][0].number)
+        self._jumped_nats = {}
+        self._restart_odds()
 
     def _begin_again(self, age_s: float, *, but_last: bool = False) -> bool:
         """Learn again from what was a while ago on, without who is off; false where that is not kept.
@@ -285,6 +309,20 @@ class NamingMonitor:
             self._slow.forget(self._slow.of_agent(agent))
         else:
             self.named[agent] = again
+
+    def _reconsider_somebody(self, held: Named, closed: Bin, chosen: list[Pair]) -> None:
+        """That somebody is off stands until all agree with what was known before."""
+        fresh = self._slow.fresh(closed, chosen)
+        found = {}
+        for agent in sorted({agent for pair in chosen for agent in pair}):
+            columns = fresh.whiten @ (fresh.sign(agent)[:, None] * fresh.directions)
+            found[agent] = _alone(fresh.value, columns, np.square(STEP_M))
+        nats = max(each for each, _ in found.values())
+        self.separation_m = np.abs(found[self._own][1]) if self._own in found else np.zeros(3)
+        self._somebody = _again(held, nats, held.shift_m)
+        if self._somebody is None:
+            self.separation_m = np.zeros(3)
+            self._restart_odds()
 
     def _reconsider_ranges(self, pair: Pair, closed: Bin) -> None:
         """The same of ranges."""

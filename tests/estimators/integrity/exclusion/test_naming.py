@@ -89,6 +89,22 @@ def test_of_three_it_is_seen_that_one_is_off_and_not_told_whose() -> None:
     assert has(found, What.SOMEBODY_OFF)
 
 
+@pytest.mark.parametrize(("drones", "seed"), [(3, 1), (3, 2), (2, 1)])
+def test_that_somebody_of_few_is_off_stands_until_all_have_agreed_for_ten_seconds(drones: int, seed: int) -> None:
+    monitor, said = NamingMonitor(1, PERIOD_S), list[float]()
+    shift = jump(1, np.array([20.0, 5.0, 0.0]), 20.0, 25.0)
+    ids = tuple(range(1, drones + 1))
+    for tick, rows in rows_of_flight(drones, seed, 60.0, shift):
+        found = monitor.observe(SharedTick(tick, ids, rows))
+        assert has(found, What.SOMEBODY_OFF) == (monitor.unattributable_nats > 0.0)
+        said += [tick * PERIOD_S - 20.0] if monitor.unattributable_nats else []
+        assert monitor.named == {}
+    assert 0.0 < said[0] <= 1.5
+    assert len(said) == round((said[-1] - said[0]) / PERIOD_S) + 1  # without a gap
+    assert 15.0 <= said[-1] <= 18.0
+    assert not monitor.separation_m.any()
+
+
 def test_all_that_are_off_alike_cannot_be_seen() -> None:
     monitor, changes = flown(5, 2, 40.0, lambda t_s, _: np.array([5.0, 0.0, 0.0]) * max(0.0, t_s - 20.0))
     assert changes == []

@@ -49,10 +49,12 @@ class IntegrityWatch:
 
     def take(self, tick: int, members: tuple[int, ...], rows: RowTable) -> RowTable:
         """The rows of a tick, by slot of ``members``, less those of receivers and ranges that are off."""
-        self._taken = SharedTick(tick, members, rows)
-        self._named = self._naming.observe(self._taken)
-        if not self._exclude:
-            return rows
+        self._named = self._naming.observe(SharedTick(tick, members, rows))
+        kept = self._without_those_off(members, rows) if self._exclude else rows
+        self._taken = SharedTick(tick, members, kept)  # nor are they a guarantee of anything
+        return kept
+
+    def _without_those_off(self, members: tuple[int, ...], rows: RowTable) -> RowTable:
         kept = np.ones(len(rows), np.bool_)
         off = [slot for slot, agent in enumerate(members) if agent in self._naming.named]
         if off:

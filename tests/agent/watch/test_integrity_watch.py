@@ -121,3 +121,17 @@ def test_a_frozen_receiver_is_off_by_how_far_its_drone_has_moved_since() -> None
     made.note_frozen(frozen=False)
     assert made.observe(estimate(3), IDS) == ()
     assert made.state(estimate(3), IDS, ()).off == {}
+
+
+@pytest.mark.parametrize("exclude", [True, False])
+def test_fixes_that_are_off_break_no_bound_any_more_once_they_are_left_out(exclude: bool) -> None:
+    limits = {"limits": {"vehicle": {"speed_mps": 8.0}}}
+    integrity = {"exclude": exclude, "position_bound_m": 8.0, "range_bound_m": 8.0}
+    made, broken = IntegrityWatch(fleet_config(ids=IDS, integrity=integrity, estimator=limits), 1), list[int]()
+    shift = jump(NAMED - 1, np.array([60.0, 20.0, 0.0]), 20.0, 99.0)
+    for tick, rows in rows_of_flight(5, 3, 35.0, shift):
+        made.take(tick, IDS, rows)
+        found = made.observe(estimate(tick), IDS)
+        broken += [tick] if any(each.what is What.BOUNDS_BROKEN and each.about == NAMED for each in found) else []
+    assert broken[0] <= 202
+    assert (broken[-1] < 320) == exclude  # ten seconds after the last one that was not left out

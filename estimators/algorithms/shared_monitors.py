@@ -29,9 +29,9 @@ from estimators.integrity.places.ambiguity import (
     rows_of,
 )
 from estimators.integrity.places.fleet_mirror import FleetMirrorMonitor, MirrorImage, mirror_offset, mirrored
-from estimators.integrity.thresholds import FLOOR_M, UNDERSTATED
+from estimators.integrity.thresholds import FLOOR_M, HELD_SIGMA_M, UNDERSTATED
 from estimators.integrity.window_evidence import WindowEvidence
-from estimators.model.layout import STATES_PER_AGENT, Layout, block
+from estimators.model.layout import STATES_PER_AGENT, BodyKind, Layout, block
 from estimators.model.limits import StateLimits
 from estimators.model.measurements import Matrix, RowTable, Vector, empty_rows
 from estimators.model.members import InformationState, MemberChange
@@ -103,7 +103,7 @@ class SharedMonitors:
         self._slot = slot
         self._period_s = period_s
         self._norm_smoothing = norm_smoothing
-        self._vehicles = layout.is_vehicle
+        self._vehicles, self._stands = layout.is_vehicle, _stands(layout)
         self._observability = ObservabilityMonitor(layout.size)
         self._mirror = FleetMirrorMonitor()
         self._ambiguities = [
@@ -139,7 +139,7 @@ class SharedMonitors:
         covariance, elsewhere = belief.covariance, None
         found_again: dict[int, Matrix] = {}
         before, rival = rivals
-        located = self._held(problem.rows, observable & ~self._doubtful)
+        located = self._held(problem.rows, observable & ~self._doubtful, self._surveyed(belief.covariance))
         self._doubtful = np.zeros(len(observable), np.bool_)
         for slot, monitor in enumerate(self._ambiguities):
             lag = 0 if slot == self._slot else HEARSAY_TICKS
@@ -172,9 +172,17 @@ class SharedMonitors:
         belief = replace(belief, covariance=covariance)
         return Verdict(belief, observable, located & observable, moves, elsewhere, found_again)
 
-    def _held(self, rows: RowTable, trusted: NDArray[np.bool_]) -> NDArray[np.bool_]:
-        """Who of the ``trusted`` ``(n,)`` has fixes, or hangs on those who have, be it over others."""
-        held = trusted & np.array([any_of(rows, POSITION, slot) for slot in range(len(trusted))])
+    def _surveyed(self, covariance: Matrix) -> NDArray[np.bool_]:
+        """``(n,)`` which bodies stand where they have been found: anchors, whoever had fixes when that was."""
+        variances = covariance.diagonal().reshape(-1, STATES_PER_AGENT)[:, :3].max(axis=1)
+        return np.asarray(self._stands & (variances <= HELD_SIGMA_M**2), np.bool_)
+
+    def _held(
+        self, rows: RowTable, trusted: NDArray[np.bool_], surveyed: NDArray[np.bool_]
+    ) -> NDArray[np.bool_]:
+        """Who of the ``trusted`` ``(n,)`` has fixes or is ``surveyed``, or hangs on those, be it over others."""
+        fixed = np.array([any_of(rows, POSITION, slot) for slot in range(len(trusted))])
+        held = trusted & (fixed | surveyed)
         while True:
             more = trusted & (held | np.array([monitor.is_held(held) for monitor in self._ambiguities]))
             if (more == held).all():
@@ -238,7 +246,7 @@ class SharedMonitors:
         self, change: MemberChange, fresh: Mapping[int, Body], limits: StateLimits | None = None
     ) -> None:
         """Go on with another fleet, its limits; ``fresh``: the states, at the last tick, of those that begin anew."""
-        self._slot, self._vehicles = change.own, change.after.is_vehicle
+        self._slot, self._vehicles, self._stands = change.own, change.after.is_vehicle, _stands(change.after)
         self._observability.change_members(change)
         monitors = []
         for slot in range(change.after.size):
@@ -249,6 +257,11 @@ class SharedMonitors:
                 monitors[-1].change_members(change, limits)
         self._doubtful = np.array([s not in fresh and self._doubtful[change.stayed[s]] for s in range(len(monitors))])
         self._ambiguities = monitors
+
+
+def _stands(layout: Layout) -> NDArray[np.bool_]:
+    """``(n,)`` which bodies are said to stand still."""
+    return np.array([kind is BodyKind.ANCHOR for kind in layout.kinds])
 
 
 def widened(covariance: Matrix, moment: Matrix, slot: int) -> Matrix:

@@ -33,8 +33,8 @@ WANDER_S = 60.0
 ACCELERATION_S = 20.0
 """Of the error of accelerations in NED: a bias turns with the body, a tilt lasts longer."""
 PAIR_S = 650.0
-"""Of the bias of ranges between two antennas, which drifts as they warm up and turn. Real robots (TIERS) ask for more:
-their biases stand still. With simulated antennas that have lobes 1000 s made fleets overconfident (ANEES 1.4)."""
+"""Of the bias of ranges between two antennas, which drifts as they warm up and turn. Real robots ask for more: those
+of TIERS stand still. Simulated antennas with lobes ask for less: with 1000 s their fleets have an ANEES of 1.4."""
 HEIGHT_S = 80_000.0
 """Of the drift of a barometer and of its scale: both go with the weather."""
 COUPLED = 7

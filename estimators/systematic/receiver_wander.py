@@ -19,7 +19,7 @@ import numpy as np
 
 from estimators.compiled.entries import entry, kernel
 from estimators.model.measurements import ROW, Matrix, RowTable, Vector
-from estimators.model.row_kernels import POSITION, VELOCITY, IntArray
+from estimators.model.row_kernels import HEIGHT, POSITION, VELOCITY, IntArray
 from estimators.systematic.slow_errors import ACCELERATION_S, WANDER_S
 
 WANDERS_M = np.array([0.02, 0.15, 0.4, 0.8, 1.6, 4.0])
@@ -38,13 +38,15 @@ MEMORY_FIXES = 300.0
 TRUST_NATS = 2.0
 """Log odds that a receiver whose white noise is all that it claims does not wander, once it has been watched."""
 WATCHED_FIXES = 40.0
-"""So many fixes tell a wander: of fewer, any is as likely as another. Until then none is taken for smaller than was
-expected: a place that is believed since a wander was taken for small is believed for long."""
+"""So many fixes tell a wander: of fewer, any is as likely as another. Until then, where there is a barometer, none in
+height is taken for smaller than was expected: barometers hold for long what was believed at first."""
 CLAIM_SHARE = 0.05
 """Of a new fix in the average of what a receiver claims."""
-VERTICAL = 1.5, 2.5
+VERTICAL = 1.0, 2.5
 """The vertical wander, which no velocity tells, against the horizontal one, at least and at most: receivers see half
 a sky."""
+HELD_VERTICAL = 1.5
+"""At least, where a barometer holds for long what was believed at first."""
 OUTLIER_SQUARE = 25.0
 """A normalised innovation beyond this says nothing of a wander."""
 MOST_OUTLIERS = 15
@@ -67,13 +69,19 @@ class ReceiverWanders:
         self._outliers = np.full(agents, -1, np.int64)
         self._fixes = np.zeros(agents, np.int64)
         self._claims_m = np.zeros((agents, 2))
+        self._heights = np.zeros(agents, np.int64)
+        """1: it has a barometer."""
         self._known: tuple[Matrix, Matrix] | None = None
 
     def weigh(self, rows: RowTable, accel: Vector, accel_variance: Vector) -> None:
         """Take in the rows of one tick, and the accelerations ``(3n,)`` from it to the next."""
         self._known = None
-        arrays = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
-        _weigh(np.ascontiguousarray(rows), accel, accel_variance, self._period_s, *arrays)
+        _weigh(np.ascontiguousarray(rows), accel, accel_variance, self._period_s, *self._arrays())
+
+    def _arrays(self) -> tuple[Matrix, Matrix, Matrix, IntArray, IntArray, Matrix, IntArray]:
+        """All that is kept of each receiver."""
+        banks = self._means, self._covariances, self._nats
+        return *banks, self._outliers, self._fixes, self._claims_m, self._heights
 
     def sizes_m(self) -> Matrix:
         """Root mean square ``(n, 3)`` of the wander over the hypotheses, per axis."""
@@ -87,21 +95,22 @@ class ReceiverWanders:
         """Sizes and factors, computed once a tick."""
         if self._known is None:
             self._known = np.empty((len(self._nats), 3)), np.empty((len(self._nats), 3))
-            _tell(self._nats, self._fixes, self._claims_m, *self._known)
+            _tell(self._nats, self._fixes, self._claims_m, self._heights, *self._known)
         return self._known
 
     def change_members(self, stayed: Mapping[int, int], agents: int) -> None:
         """Go on with another fleet; ``stayed``: by new slot, the old one."""
-        before = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
+        before = self._arrays()
         self._make(agents)
-        after = self._means, self._covariances, self._nats, self._outliers, self._fixes, self._claims_m
         for slot, old in stayed.items():
-            for new_array, old_array in zip(after, before, strict=True):
+            for new_array, old_array in zip(self._arrays(), before, strict=True):
                 new_array[slot] = old_array[old]
 
 
-@entry("void(float64[:, :, ::1], int64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])")
-def _tell(nats: Matrix, fixes: IntArray, claims: Matrix, sizes: Matrix, factors: Matrix) -> None:
+@entry("void(float64[:, :, ::1], int64[::1], float64[:, ::1], int64[::1], float64[:, ::1], float64[:, ::1])")
+def _tell(
+    nats: Matrix, fixes: IntArray, claims: Matrix, heights: IntArray, sizes: Matrix, factors: Matrix
+) -> None:
     """sizes, factors ``(n, 3)`` <- what the hypotheses make of the wander and of the white noise."""
     agents, models = nats.shape[0], nats.shape[2]
     weights, size, unused = np.empty(models), np.empty((agents, 2)), np.empty((agents, 2))
@@ -117,7 +126,8 @@ def _tell(nats: Matrix, fixes: IntArray, claims: Matrix, sizes: Matrix, factors:
                 total += weight
                 wander += weight * HYPOTHESES_M[h] ** 2
                 white += weight * FACTORS[h] ** 2
-            size[a, group] = np.sqrt(max(wander / total, (1.0 - watched) * EXPECTED_M2))
+            least = (1.0 - watched) * EXPECTED_M2 if group == 1 and heights[a] else 0.0
+            size[a, group] = np.sqrt(max(wander / total, least))
             unused[a, group] = claims[a, group] * np.sqrt(max(1.0 - white / total, 0.0))
             for axis in range(2 * group, 2 + group):
                 factors[a, axis] = np.sqrt(white / total)
@@ -126,12 +136,13 @@ def _tell(nats: Matrix, fixes: IntArray, claims: Matrix, sizes: Matrix, factors:
         across = max(size[a, 0], unused[a, 0], usual[0])
         down = max(size[a, 1], unused[a, 1], usual[1])
         sizes[a, 0], sizes[a, 1] = across, across
-        sizes[a, 2] = min(max(down, VERTICAL[0] * across), VERTICAL[1] * across)
+        least = HELD_VERTICAL if heights[a] else VERTICAL[0]
+        sizes[a, 2] = min(max(down, least * across), VERTICAL[1] * across)
 
 
 @entry(
     "void(ROW[::1], float64[::1], float64[::1], float64, float64[:, :, :, ::1], float64[:, :, :, :, ::1],"
-    " float64[:, :, ::1], int64[::1], int64[::1], float64[:, ::1])",
+    " float64[:, :, ::1], int64[::1], int64[::1], float64[:, ::1], int64[::1])",
     ROW=ROW,
 )
 def _weigh(
@@ -145,12 +156,15 @@ def _weigh(
     outliers: IntArray,
     fixes: IntArray,
     claims: Matrix,
+    heights: IntArray,
 ) -> None:
     agents, models = means.shape[0], means.shape[2]
     forget = 1.0 - 1.0 / MEMORY_FIXES
     fixed = np.zeros(agents, np.int64)  # 1: a fix, 2: one that some hypothesis explains
     for r in range(rows.shape[0]):
         row = rows[r]
+        if row["kind"] == HEIGHT and row["x"] == 1.0:
+            heights[row["agent"]] = 1
         if (row["kind"] != POSITION and row["kind"] != VELOCITY) or np.isfinite(row["half_width"]):
             continue
         axis = _axis(row)

@@ -26,10 +26,13 @@ from agent.feedback.handover import Handover
 from estimators.integrity.protection.levels import ProtectionLevel
 from estimators.model.measurements import Vector
 
-AGREE_HORIZONTAL_M, AGREE_VERTICAL_M = 1.5, 5.0
-"""How far the estimate is from the autopilot's own position at most, on average over the time of agreement."""
-STRAY_M = 3.0
+AGREE_HORIZONTAL_M, AGREE_VERTICAL_M = 3.0, 5.0
+"""How far the estimate is from the autopilot's own position at most, on average over the time of agreement: its
+receiver may wander by a metre per axis, which the fleet averages out. A wrong origin or frame makes more of it."""
+STRAY_M = 4.5
 """How far at most at one instant: an autopilot's position lags by a quarter of a second."""
+RETURNED_M = 3.0
+"""How far fixes that are back are from the estimate at most, or its protection level where that is larger."""
 FARTHEST_ORIGIN_M = 10_000.0
 """Axes of two places further apart are not parallel enough, and no fleet is that large: something is wrong."""
 STALE_S = 0.5
@@ -229,7 +232,7 @@ class Gatekeeper:
         if offer.gps_lost or offer.fix_off_m is None or bad:
             self._gps_agrees_since_s = None
             return None
-        limit_m = max(STRAY_M, offer.level.horizontal_m)
+        limit_m = max(RETURNED_M, offer.level.horizontal_m)
         if offer.fix_off_m > limit_m:
             self._gps_agrees_since_s = None
             return offer.fix_off_m

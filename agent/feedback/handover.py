@@ -15,8 +15,9 @@ from estimators.model.measurements import Vector
 
 RATE_MPS = 0.3
 """So fast is a difference taken off, horizontally and vertically."""
-LARGEST_HORIZONTAL_M, LARGEST_VERTICAL_M = 1.5, 5.0
-"""A larger difference is an autopilot that is lost already: it is set to the estimate at once."""
+LARGEST_HORIZONTAL_M, LARGEST_VERTICAL_M = 2.25, 5.0
+"""An autopilot that is further off is set to the estimate at once: what is fed counts the difference as error, and so
+loose a feed would not hold an autopilot that drifts."""
 
 
 class Handover:

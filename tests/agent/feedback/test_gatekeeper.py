@@ -183,7 +183,7 @@ def test_a_restart_in_the_outage_withholds_for_the_rest_of_it(feeding: Run) -> N
     assert feeding.go(4.0).phase is FeedPhase.READY  # GPS is back
 
 
-@pytest.mark.parametrize("off_m", [(5.0, 0.0, 0.0), (0.0, -2.0, 0.0), (0.0, 0.0, 8.0), (0.0, 0.0, -300.0)])
+@pytest.mark.parametrize("off_m", [(5.0, 0.0, 0.0), (0.0, -3.5, 0.0), (0.0, 0.0, 8.0), (0.0, 0.0, -300.0)])
 def test_an_origin_that_is_wrong_is_found_before(off_m: tuple[float, float, float]) -> None:
     run = Run()
 
@@ -224,8 +224,15 @@ def test_a_gps_that_is_back_300_m_off_is_told_and_the_feed_goes_on(feeding: Run)
     assert (verdict.phase, verdict.feed, verdict.gps_off_m) == (FeedPhase.FEEDING, True, 300.0)
 
 
+def test_a_receiver_that_wanders_as_receivers_do_is_no_wrong_origin() -> None:
+    run = Run()
+
+    assert run.go(10.0, shift_m=(2.0, -1.5, 0.0)).phase is FeedPhase.READY
+    assert run.go(2.0, shift_m=(2.0, -1.5, 0.0), gps_lost=True).phase is FeedPhase.FEEDING
+
+
 def test_a_receiver_that_is_off_and_left_out_is_a_lost_one(ready: Run) -> None:
-    pulled = np.array((4.0, 0.0, 0.0))
+    pulled = np.array((5.0, 0.0, 0.0))
     for _ in range(10):  # the spoofer has pulled the autopilot away before anybody knows
         ready.t_s += PERIOD_S
         ready.gate.judge(offer(ready.t_s, own_m=offer(ready.t_s).own_m + pulled))

@@ -25,7 +25,7 @@ def test_it_begins_where_the_autopilot_believes_to_be_and_ends_at_the_estimate()
     assert handover.shift_m.tolist() == [0.0, 0.0, 0.0]
 
 
-@pytest.mark.parametrize("apart_m", [None, (2.0, 0.0, 0.0), (0.0, 0.0, 7.0), (math.nan, 0.0, 0.0)])
+@pytest.mark.parametrize("apart_m", [None, (2.5, 0.0, 0.0), (0.0, 0.0, 7.0), (math.nan, 0.0, 0.0)])
 def test_an_autopilot_that_is_lost_or_says_nothing_is_set_to_the_estimate(
     apart_m: tuple[float, float, float] | None,
 ) -> None:

@@ -50,6 +50,18 @@ def test_the_hand_over_is_no_step(flavour: Any) -> None:
     assert flight.step_m(BACK_S, BACK_S + 9.0) < 0.3
 
 
+@pytest.mark.parametrize(("seed", "step_m"), [(11, 0.3), (20, 4.0)])
+def test_a_receiver_may_be_metres_off_when_its_fixes_end(seed: int, step_m: float) -> None:
+    # GIVEN an autopilot whose receiver has wandered off by 1.7 or 2.1 m
+    flight = FedVehicle("px4", outage_s=(LOST_S, 40.0), seed=seed).fly(22.0)
+    assert flight.errors_m(LOST_S - 0.2, LOST_S).max() > 1.5
+    # THEN it is fed all the same: without a step as long as the feed can hold it meanwhile, else set to the estimate
+    assert flight.phases(LOST_S + 1.0, 22.0) == {FeedPhase.FEEDING}
+    assert flight.errors_m(LOST_S + 2.0, 22.0).max() < 1.5
+    assert flight.step_m(LOST_S, LOST_S + 4.0) < step_m
+    assert flight.first_said("NOT_FUSED") == np.inf
+
+
 @pytest.mark.parametrize(
     ("flavour", "kind", "message", "parameters"),
     [

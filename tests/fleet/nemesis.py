@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field
@@ -123,13 +124,20 @@ class StruckAgent(OnboardAgent):
         self.blows: tuple[Blow, ...] = ()
         self.stale_taken = 0
         self._heard: list[tuple[float, str, bytes]] = []
+        self._stopped_until_s = -math.inf
 
     def _struck(self, kind: Kind, host_s: float) -> Blow | None:
         at_s = host_s - HOST_START_S
         return next((each for each in self.blows if each.kind == kind and each.from_s <= at_s < each.to_s), None)
 
     def advance(self, host_s: float) -> list[Output]:
-        return [] if self._struck("stop", host_s) else super().advance(host_s)
+        blow = self._struck("stop", host_s)
+        self._stopped_until_s = -math.inf if blow is None else HOST_START_S + blow.to_s
+        return [] if blow else super().advance(host_s)
+
+    def next_due_host_s(self) -> float:
+        """Nothing is due while it is suspended: asked for what was due before, the queue would not get on."""
+        return max(super().next_due_host_s(), self._stopped_until_s)
 
     def keep_house(self, *, unix_s: float, host_s: float) -> list[Output]:
         return [] if self._struck("stop", host_s) else super().keep_house(unix_s=unix_s, host_s=host_s)

@@ -263,18 +263,17 @@ class Feeder:
     def _encoded(self, ready: Ready, link: FedAutopilot) -> list[Message]:
         """The message for this autopilot; none where it cannot be made."""
         assert ready.stamp_us is not None
-        shift_m = self.verdict.shift_m
-        fed_m = ready.mean[:3] + ready.ahead_s * ready.mean[3:] + shift_m
+        velocity = ready.mean[3:] + self.verdict.shift_rate_mps
+        fed_m = ready.mean[:3] + self.verdict.shift_m + ready.ahead_s * velocity
         north, east, down = (float(each) for each in fed_m)
         about_m = np.zeros(3) if self.watch.origin_m is None else np.array(self.watch.origin_m)
         local = fed_m - about_m
         ahead = np.eye(6) + ready.ahead_s * np.eye(6, k=3)
         covariance = ahead @ ready.covariance @ ahead.T
-        covariance[:3, :3] += np.outer(shift_m, shift_m)  # so far is it from the estimate, knowingly
         state = FedState(
             ready.stamp_us,
             (float(local[0]), float(local[1]), float(local[2])),
-            (float(ready.mean[3]), float(ready.mean[4]), float(ready.mean[5])),
+            (float(velocity[0]), float(velocity[1]), float(velocity[2])),
             covariance,
             self.verdict.reset_counter,
             ready.quaternion,

@@ -96,6 +96,8 @@ class FeedVerdict:
     """How far the autopilot's GPS, which is back, is from the estimate that it contradicts."""
     shift_m: Vector = field(default_factory=lambda: np.zeros(3))
     """To be added to the position ``(3,)`` NED, so that a feed begins where the autopilot believes to be."""
+    shift_rate_mps: Vector = field(default_factory=lambda: np.zeros(3))
+    """To be added to the velocity ``(3,)``: how fast that shrinks."""
 
 
 class Gatekeeper:
@@ -154,7 +156,8 @@ class Gatekeeper:
         if feed:
             self._last_fed_s = offer.now_s
         why = "" if feed else self._why
-        return FeedVerdict(self.phase, feed, self.resets, why, gps_off_m, self._handover.shift_m)
+        handover = self._handover
+        return FeedVerdict(self.phase, feed, self.resets, why, gps_off_m, handover.shift_m, handover.rate_mps)
 
     # --- is it good? --------------------------------------------------------------------------------------------
 

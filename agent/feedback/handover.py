@@ -13,25 +13,29 @@ import numpy as np
 
 from estimators.model.measurements import Vector
 
-RATE_MPS = 0.3
+RATE_MPS = 0.4
 """So fast is a difference taken off, horizontally and vertically."""
-LARGEST_HORIZONTAL_M, LARGEST_VERTICAL_M = 2.25, 5.0
-"""An autopilot that is further off is set to the estimate at once: what is fed counts the difference as error, and so
-loose a feed would not hold an autopilot that drifts."""
+LARGEST_HORIZONTAL_M, LARGEST_VERTICAL_M = 3.0, 5.0
+"""An autopilot that is further off is set to the estimate at once: it would be led astray for too long."""
 
 
 class Handover:
-    """Of one feed: ``shift_m`` ``(3,)`` NED is added to the estimate."""
+    """Of one feed: ``shift_m`` and ``rate_mps`` ``(3,)`` NED are added to the estimate's position and velocity.
+
+    What is fed is then where an autopilot is that moves as it is told: it knows nothing of the difference, which is
+    no error of what it is fed. Counted as one, it made a feed so loose that an autopilot drifted by metres.
+    """
 
     def __init__(self) -> None:
         self.shift_m: Vector = np.zeros(3)
+        self.rate_mps: Vector = np.zeros(3)
         self._at_s = -math.inf
 
     def begin(self, apart_m: Vector | None, t_s: float) -> None:
         """The feed begins, or is only prepared, with an estimate of ``t_s`` that is ``apart_m`` ``(3,)`` from the
         autopilot's own position; ``None`` if that is not known."""
         self._at_s = t_s
-        self.shift_m = np.zeros(3)
+        self.shift_m, self.rate_mps = np.zeros(3), np.zeros(3)
         if apart_m is None or not np.isfinite(apart_m).all():
             return
         if math.hypot(apart_m[0], apart_m[1]) <= LARGEST_HORIZONTAL_M and abs(apart_m[2]) <= LARGEST_VERTICAL_M:
@@ -39,11 +43,14 @@ class Handover:
 
     def go_on(self, t_s: float) -> Vector:
         """Take some of it off; by how much the shift changed, ``(3,)``."""
-        most_m = RATE_MPS * max(t_s - self._at_s, 0.0)
+        elapsed_s = max(t_s - self._at_s, 0.0)
+        most_m = RATE_MPS * elapsed_s
         self._at_s = t_s
         before_m = self.shift_m
         across_m = math.hypot(before_m[0], before_m[1])
         sizes_m = np.array((across_m, across_m, abs(before_m[2])))
         left_m = np.maximum(sizes_m - most_m, 0.0)
         self.shift_m = before_m * np.divide(left_m, sizes_m, out=np.zeros(3), where=sizes_m > 0.0)
-        return np.asarray(self.shift_m - before_m)
+        change_m = np.asarray(self.shift_m - before_m)
+        self.rate_mps = change_m / elapsed_s if elapsed_s > 0.0 else np.zeros(3)
+        return change_m

@@ -97,7 +97,7 @@ def test_the_first_position_that_is_fed_is_the_autopilots_own(ready: Run) -> Non
     now = offer(ready.t_s)
     assert now.position_m + verdict.shift_m == pytest.approx(now.own_m)
 
-    assert ready.go(1.0, gps_lost=True).shift_m[2] == pytest.approx(0.0, abs=1e-9)  # 0.3 m at 0.3 m/s
+    assert ready.go(1.0, gps_lost=True).shift_m[2] == pytest.approx(0.0, abs=1e-9)  # 0.3 m at 0.4 m/s
     assert ready.go(5.0, gps_lost=True).shift_m.tolist() == [0.0, 0.0, 0.0]
 
 

@@ -57,8 +57,8 @@ class SizedRow:
 
     def flights(self, seeds: Sequence[int]) -> list[Flight]:
         """One of each seed."""
-        faults = () if self.row is None else self.row.faults
-        return [Flight(self.config, seed, faults, self.duration_s) for seed in seeds]
+        faults, radio = ((), None) if self.row is None else (self.row.faults, self.row.radio)
+        return [Flight(self.config, seed, faults, self.duration_s, radio) for seed in seeds]
 
 
 def cases(config: FleetConfig, rows: Sequence[FaultRow], sizes: Sequence[int], clean_s: float) -> list[SizedRow]:

@@ -11,7 +11,7 @@ import pytest
 
 from agent.config.reading import load_config
 from fleetloc import cli
-from fleetloc.bench.fault_rows import FaultRow
+from fleetloc.bench.fault_rows import FaultRow, RadioSpell
 from fleetloc.bench.integrity.flights import Promises, first_drones
 from fleetloc.bench.integrity.study import SizedRow, case_figures, cases
 from fleetloc.errors import InputError
@@ -77,6 +77,15 @@ def test_smaller_fleets_are_the_first_drones() -> None:
     assert fleet.ids == (1, 2, 3)
     assert sim_table(fleet).faults == ()
     assert {path.agent for path in sim_table(fleet).paths} == {1, 2, 3}
+
+
+def test_a_bad_radio_is_flown_too_and_has_no_culprit() -> None:
+    row = FaultRow(name="loss", title="x", radio=RadioSpell(from_s=15.0, to_s=35.0, loss=0.6))
+    _, bad = cases(load_config(CONFIGS / "spoof.toml"), [row], [4], 20.0)
+    (flight,) = bad.flights([1])
+    assert flight.configured().transport.loss == 0.6
+    assert bad.culprits == (frozenset(), frozenset())
+    assert not bad.undetectable
 
 
 def test_sizes_beyond_the_fleet_are_refused() -> None:

@@ -163,22 +163,54 @@ def _sigmas(covariance: list[float], places: tuple[int, int, int]) -> Triple:
 
 
 def _flow(message: Message) -> FlowSample | str:
-    """OPTICAL_FLOW_RAD, its time that of the middle of what was integrated, from the stamp.
+    """OPTICAL_FLOW_RAD, its time that of the middle of what was integrated, from the stamp."""
+    return integrated_flow(
+        0.0,
+        message.integration_time_us * 1e-6,
+        (message.integrated_x, message.integrated_y),
+        (message.integrated_xgyro, message.integrated_ygyro),
+        message.quality,
+        message.distance,
+    )
 
-    Turning about x to the right gives positive flow about x, moving along y negative flow; moving along x gives
-    positive flow about y.
+
+def integrated_flow(
+    end_s: float,
+    duration_s: float,
+    flow_rad: tuple[float, float],
+    turned_rad: tuple[float, float],
+    quality: float,
+    distance_m: float,
+) -> FlowSample | str:
+    """What a flow sensor integrated until ``end_s`` about its axes x and y, and how far the body turned meanwhile.
+
+    Gives why it tells nothing otherwise.
     """
-    duration_s = message.integration_time_us * 1e-6
-    about = (message.integrated_x, message.integrated_y, message.integrated_xgyro, message.integrated_ygyro)
     if not 0.0 < duration_s <= LONGEST_FLOW_S:
         return "integrated over no time"
-    if not all(map(math.isfinite, about)):
+    x, y = (each / duration_s for each in flow_rad)
+    about_x, about_y = (each / duration_s for each in turned_rad)
+    return flow_of(end_s - 0.5 * duration_s, (x, y), (about_x, about_y), quality, distance_m)
+
+
+def flow_of(
+    t_s: float,
+    flow_radps: tuple[float, float],
+    turning_radps: tuple[float, float],
+    quality: float,
+    distance_m: float = math.nan,
+) -> FlowSample | str:
+    """Rates about a sensor's axes x and y, as PX4 and ArduPilot have them; gives why they tell nothing otherwise.
+
+    Turning about x to the right gives positive flow about x, moving along y negative flow; moving along x gives
+    positive flow about y. ``quality`` from 0, nothing was seen, to 255; a distance that is NaN or 0 was not measured.
+    """
+    if not all(map(math.isfinite, (*flow_radps, *turning_radps))):
         return "not finite"
-    if not message.quality:
+    if not quality > 0.0:
         return "no quality"
-    forward = (about[1] - about[3]) / duration_s
-    right = -(about[0] - about[2]) / duration_s
+    forward, right = flow_radps[1] - turning_radps[1], turning_radps[0] - flow_radps[0]
     best, worst = FLOW_SIGMA_RADPS
-    sigma = worst + (best - worst) * message.quality / BEST_FLOW
-    distance_m = message.distance if math.isfinite(message.distance) and message.distance > 0.0 else None
-    return FlowSample(-0.5 * duration_s, (forward, right), sigma, distance_m)
+    sigma = worst + (best - worst) * min(quality / BEST_FLOW, 1.0)
+    known = math.isfinite(distance_m) and distance_m > 0.0
+    return FlowSample(t_s, (forward, right), sigma, distance_m if known else None)

@@ -17,6 +17,7 @@ from agent.sensing.samples import (
     AttitudeSample,
     AutopilotEstimate,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
@@ -122,6 +123,21 @@ def test_the_first_barometer_gives_altitudes_of_its_pressure(
     assert [sample.t_s for sample in heights[:10]] == pytest.approx([34.0 + 0.1 * k for k in range(10)], abs=1e-6)
     assert {round(sample.altitude_m) for sample in heights} == {500}
     assert source.counts.skipped["baro: not the first one"] == 11
+
+
+def test_flow_of_a_log_is_used(tmp_path: Path) -> None:
+    layout = "QBffff"
+    described = fmt(122, "OF", layout, "TimeUS,Qual,flowX,flowY,bodyX,bodyY")
+    told = [(200, 0.8, 1.2, 0.2, 0.4), (0, 0.8, 1.2, 0.2, 0.4), (200, float("nan"), 1.2, 0.2, 0.4)]
+    entries = b"".join(entry(122, layout, 34_000_000 + 100_000 * k, *each) for k, each in enumerate(told))
+    path = tmp_path / "a.BIN"
+    path.write_bytes(flight() + described + entries)
+    source, events = read(path)
+    (found,) = [event.sample for event in events if isinstance(event.sample, FlowSample)]
+    assert found.passing_radps == pytest.approx((0.8, -0.6))
+    assert found.distance_m is None
+    assert source.counts.skipped["flow: no quality"] == 1
+    assert source.counts.skipped["flow: not finite"] == 1
 
 
 def test_odometry_and_range_finders_of_a_log_are_used(tmp_path: Path) -> None:

@@ -19,6 +19,7 @@ from agent.sensing.samples import (
     AttitudeSample,
     AutopilotEstimate,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
@@ -319,3 +320,43 @@ def test_without_the_package_the_line_says_what_to_install(tmp_path: Path, monke
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(LogError, match=r"pip install 'fleetloc\[ulog\]'"):
         read(path)
+
+
+@pytest.mark.parametrize(
+    ("topic", "layout"),
+    [
+        (
+            "vehicle_optical_flow",
+            {"timestamp_sample": "uint64_t", "pixel_flow": "float[2]", "delta_angle": "float[3]",
+             "distance_m": "float", "integration_timespan_us": "uint64_t", "quality": "uint8_t"},
+        ),
+        (
+            "optical_flow",
+            {"pixel_flow_x_integral": "float", "pixel_flow_y_integral": "float", "gyro_x_rate_integral": "float",
+             "gyro_y_rate_integral": "float", "gyro_z_rate_integral": "float", "ground_distance_m": "float",
+             "integration_timespan": "uint64_t", "quality": "uint8_t"},
+        ),
+    ],
+)  # fmt: skip
+def test_flow_is_read_in_both_layouts(tmp_path: Path, topic: str, layout: dict[str, str]) -> None:
+    # GIVEN 0.05 s of a drone that moves forward and to the left, and turns; one of no quality, one of no duration
+    log, nan = Ulog(), float("nan")
+    log.topic(topic, **layout)
+    for k, (quality, duration_us, distance_m) in enumerate(
+        [(255, 50_000, 2.0), (255, 50_000, nan), (0, 50_000, 2.0), (99, 0, 2.0)]
+    ):
+        told = [] if "timestamp_sample" not in layout else [1_000_000 + 100_000 * k]
+        log.add(topic, 1_000_000 + 100_000 * k, *told, 0.04, 0.06, 0.01, 0.02, 0.3, distance_m, duration_us, quality)
+    path = tmp_path / "a.ulg"
+    path.write_bytes(log.bytes())
+    source = open_log(path, frame=FRAME, sensors=SensorsTable(), ours=OwnWords(odometry=True))
+    found = [event.sample for event in source.events()]
+    near, far = found
+    assert isinstance(near, FlowSample)
+    assert isinstance(far, FlowSample)
+    # THEN it is told as over the ground, in the middle of what was integrated
+    assert near.passing_radps == pytest.approx((0.8, -0.6))
+    assert (near.distance_m, far.distance_m) == (2.0, None)
+    assert near.t_s == pytest.approx(0.975)
+    assert source.counts.skipped["flow: no quality"] == 1
+    assert source.counts.skipped["flow: integrated over no time"] == 1

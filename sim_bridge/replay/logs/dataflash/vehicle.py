@@ -14,7 +14,7 @@ from collections.abc import Callable
 from agent.config.tables import SensorsTable
 from agent.mavlink.boot_times import WRAP_MS_S
 from agent.mavlink.sample_adapter import GROUND_SHARE, GROUND_SIGMA_M
-from agent.mavlink.velocities import MAX_MPS, SIGMA_MPS
+from agent.mavlink.velocities import MAX_MPS, SIGMA_MPS, flow_of
 from agent.sensing.barometer import pressure_altitude_m
 from agent.sensing.frames import FleetFrame, from_euler, normalised
 from agent.sensing.receivers import ReceiverChoice
@@ -22,6 +22,7 @@ from agent.sensing.samples import (
     AttitudeSample,
     AutopilotEstimate,
     BaroSample,
+    FlowSample,
     GpsSample,
     GroundSample,
     ImuSample,
@@ -44,6 +45,7 @@ WANTED: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("GPS", "GPS2"), _GPS),
     **dict.fromkeys(("GPA", "GPA2"), _GPA),
     "VISV": ("TimeUS", "VX", "VY", "VZ", "VErr", "Ign", "Q"),
+    "OF": ("TimeUS", "Qual", "flowX", "flowY", "bodyX", "bodyY"),
     "RFND": ("TimeUS", "Instance", "Dist", "Stat", "Orient"),
     "XKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
     "NKF1": ("TimeUS", "C", "VN", "VE", "VD", "PN", "PE", "PD"),
@@ -184,6 +186,7 @@ class DataflashVehicle:
             "ATT": self._attitude,
             "BARO": self._barometer,
             "VISV": self._odometry,
+            "OF": self._flow,
             "RFND": self._range_finder,
             "XKF4": self._primary_lane,
             "ORGN": self._origin,
@@ -252,6 +255,12 @@ class DataflashVehicle:
         told = values.get("VErr", math.nan)
         sigma_mps = told if math.isfinite(told) and told > 0.0 else SIGMA_MPS
         return VelocitySample(t_s, velocity, (sigma_mps, sigma_mps, sigma_mps), in_body=False)
+
+    def _flow(self, values: Values, t_s: float) -> LogSample | None:
+        """OF: rates about the axes of the body, rad/s, of the picture and of the body itself."""
+        flow, turning = (values["flowX"], values["flowY"]), (values["bodyX"], values["bodyY"])
+        made = flow_of(t_s, flow, turning, values["Qual"])
+        return made if isinstance(made, FlowSample) else self._skip(f"flow: {made}")
 
     def _range_finder(self, values: Values, t_s: float) -> LogSample | None:
         """RFND: m; of several the first."""

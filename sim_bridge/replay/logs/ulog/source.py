@@ -25,6 +25,7 @@ from sim_bridge.replay.logs.events import (
 )
 from sim_bridge.replay.logs.gps_time import RECEIVER_LATENCY_SIGMA_S, fitted, since_earliest
 from sim_bridge.replay.logs.surveyed import OwnWords, SurveyedLog
+from sim_bridge.replay.logs.ulog.flow import FLOW_TOPICS, flow_samples
 from sim_bridge.replay.logs.ulog.odometry import FIELDS, VISUAL_ODOMETRY, odometry_samples
 from sim_bridge.replay.logs.ulog.samples import (
     FIX_3D,
@@ -80,6 +81,8 @@ class UlogSource(SurveyedLog):
                 streams.append(ground_samples(table, skipped))
             elif name == VISUAL_ODOMETRY:
                 streams.append(odometry_samples(table, skipped, may_be_ours=self._ours.odometry))
+            elif name in FLOW_TOPICS:
+                streams.append(flow_samples(table, skipped))
             elif name == "vehicle_attitude":
                 streams.append(attitude_samples(table, skipped))
             elif name == "vehicle_local_position":
@@ -96,7 +99,7 @@ class UlogSource(SurveyedLog):
     def _tables(self) -> Tables:
         if self._loaded is None:
             self._damage.clear()
-            wanted = {**WANTED, VISUAL_ODOMETRY: FIELDS}
+            wanted = {**WANTED, VISUAL_ODOMETRY: FIELDS, **FLOW_TOPICS}
             self._loaded = load_tables(self.path, wanted, self._damage, several=GPS_TOPICS)
         return self._loaded
 

@@ -259,11 +259,24 @@ def _correct(row: np.void, seen: Vector, place: bool, mean: Matrix, covariance: 
 def _predict(mean: Vector, covariance: Matrix, push: float, noise: float, size: float, dt: float) -> None:
     """One axis of one hypothesis one tick on."""
     keep_e, keep_w = np.exp(-dt / ACCELERATION_S), np.exp(-dt / WANDER_S)
-    move = np.array(
-        [[1.0, dt, -0.5 * dt * dt, 0.0], [0.0, 1.0, -dt, 0.0], [0.0, 0.0, keep_e, 0.0], [0.0, 0.0, 0.0, keep_w]]
-    )
-    into = np.array([0.5 * dt * dt, dt, 0.0, 0.0])
-    mean[:] = np.dot(move, mean) + into * push
-    covariance[:, :] = np.dot(np.dot(move, covariance), move.T.copy()) + noise * np.outer(into, into)
+    half = 0.5 * dt * dt
+    mean[0] += dt * mean[1] - half * mean[2] + half * push
+    mean[1] += dt * (push - mean[2])
+    mean[2] *= keep_e
+    mean[3] *= keep_w
+    for j in range(4):  # rows, then columns
+        covariance[0, j] += dt * covariance[1, j] - half * covariance[2, j]
+        covariance[1, j] -= dt * covariance[2, j]
+        covariance[2, j] *= keep_e
+        covariance[3, j] *= keep_w
+    for i in range(4):
+        covariance[i, 0] += dt * covariance[i, 1] - half * covariance[i, 2]
+        covariance[i, 1] -= dt * covariance[i, 2]
+        covariance[i, 2] *= keep_e
+        covariance[i, 3] *= keep_w
+    covariance[0, 0] += half * half * noise
+    covariance[0, 1] += half * dt * noise
+    covariance[1, 0] += half * dt * noise
+    covariance[1, 1] += dt * dt * noise
     covariance[2, 2] += (1.0 - keep_e * keep_e) * ACCEL_ERROR_MPS2**2
     covariance[3, 3] += (1.0 - keep_w * keep_w) * size * size

@@ -2,24 +2,23 @@
 
 from __future__ import annotations
 
-import math
 from typing import Literal
 
 import numpy as np
+from numpy.typing import NDArray
 
 from estimators.compiled.entries import entry, kernel
 from estimators.model.layout import BodyKind, Layout
 from estimators.model.measurements import (
     ROW,
     InputTable,
-    Kind,
     Matrix,
     RowTable,
     Vector,
     empty_rows,
 )
 from estimators.model.members import MemberChange
-from estimators.model.row_kernels import IntArray, mark_usable
+from estimators.model.row_kernels import RANGE, IntArray, mark_usable
 from estimators.model.unknown_motion import TARGET_ACCEL_VARIANCE
 from estimators.window.inputs import InputHistory
 
@@ -134,7 +133,9 @@ class MeasurementWindow:
         """Rows up to the window's last tick, sorted, and the first row of each tick ``(N+2,)``."""
         rows = self._rows
         if self._shared:
-            rows = rows[~_seen_from_other_end(rows)]
+            once = np.empty(len(rows), np.bool_)
+            _mark_once(rows, once)
+            rows = rows[once]
         start = np.empty(self.last - self.first + 2, np.int64)
         _find_starts(rows, self.first, start)
         return rows[: start[-1]], start
@@ -237,21 +238,30 @@ def _is_before(a: np.void, b: np.void) -> bool:
     return bool(a["z"] < b["z"])
 
 
-def _seen_from_other_end(rows: RowTable) -> np.ndarray[tuple[int], np.dtype[np.bool_]]:
-    """Ranges whose exchange is in the table from its lower end too: one exchange, one measurement.
+@entry("void(ROW[::1], boolean[::1])", ROW=ROW)
+def _mark_once(rows: RowTable, once: NDArray[np.bool_]) -> None:
+    """once ``(m,)`` <- false for ranges whose exchange is in the sorted rows from its lower end too.
 
-    Two between other antennas of the same agents are two measurements.
+    One exchange is one measurement. Two between other antennas of the same agents are two.
     """
-    between = np.flatnonzero(rows["kind"] == Kind.RANGE)
-    drop = np.zeros(len(rows), np.bool_)
-    ranges = rows[["tick", "agent", "other", "x", "y", "z"]][between].tolist()
-    lower: dict[tuple[int, int, int], list[tuple[float, float, float]]] = {}
-    for t, a, b, *shift in ranges:
-        if a < b:
-            lower.setdefault((t, a, b), []).append((-shift[0], -shift[1], -shift[2]))
-    for at, (t, a, b, *shift) in zip(between, ranges, strict=True):
-        drop[at] = any(math.dist(seen, shift) < SAME_ANTENNAS_M for seen in lower.get((t, b, a), ()))
-    return drop
+    first = 0
+    for r in range(rows.shape[0]):
+        row = rows[r]
+        while rows[first]["tick"] < row["tick"]:
+            first += 1
+        once[r] = True
+        if row["kind"] != RANGE or row["agent"] <= row["other"]:
+            continue
+        for k in range(first, rows.shape[0]):
+            seen = rows[k]
+            if seen["tick"] != row["tick"]:
+                break
+            if seen["kind"] != RANGE or seen["agent"] != row["other"] or seen["other"] != row["agent"]:
+                continue
+            apart = (seen["x"] + row["x"]) ** 2 + (seen["y"] + row["y"]) ** 2 + (seen["z"] + row["z"]) ** 2
+            if np.sqrt(apart) < SAME_ANTENNAS_M:
+                once[r] = False
+                break
 
 
 def _renamed(rows: RowTable, change: MemberChange) -> RowTable:

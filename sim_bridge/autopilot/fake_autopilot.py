@@ -388,6 +388,7 @@ class FakeAutopilot:
                 fed.velocity_sigma_mps,
                 taken_s,
                 int(message.reset_counter),
+                relative=state.flavour.name == "px4",
             )
             state.navigation.on_outside(outside, now)
 

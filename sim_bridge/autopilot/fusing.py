@@ -25,6 +25,10 @@ REMEMBERED_S = 1.0
 GPS_STOPPED_S = 1.0
 """Without a fix for so long, GPS holds nothing any more, and a feed that begins sets the state."""
 GPS_SPEED_SIGMA_MPS = 0.3
+OFFSET_DENSITY_M_PER_SQRT_S = 0.13
+"""PX4 takes so fast a wander for a feed's own offset while it counts on its receiver."""
+GPS_SIGMA_M = 0.5
+"""EKF2_GPS_P_NOISE: no feed counts as better while GPS is used."""
 LEAST_SIGMA_M, LEAST_SIGMA_MPS = 0.1, 0.1
 BAROMETER_SIGMA_M, BAROMETER_EVERY_S, BAROMETER_SHARE = 0.5, 0.1, 0.05
 """While GPS gives heights, the barometer's offset follows them by this share of each sample."""
@@ -44,12 +48,43 @@ class LossFigures:
     """Its own fixes are taken for so old when they come: EKF2_GPS_DELAY; ArduPilot's lag of a receiver."""
     returns_after_s: float | None
     """Its earlier mode comes back when it has positions again for so long; ``None``: it stays in LAND."""
+    gps_kept_s: float = 0.0
+    """So long after its last good fix it still counts on its receiver: meanwhile positions that are ``relative`` give
+    it nothing but their motion, and the first one after that time is set."""
+    gps_start_ratio: float = np.inf
+    """A receiver that is back is left out while a feed holds the state and its ratios of both axes sum up to more."""
 
 
 FIGURES: dict[FlavourName, LossFigures] = {
-    "px4": LossFigures(flag_s=0.7, failsafe_s=4.5, refused_s=1.0, gps_delay_s=0.11, returns_after_s=2.0),
+    "px4": LossFigures(
+        flag_s=0.7,
+        failsafe_s=4.5,
+        refused_s=1.0,
+        gps_delay_s=0.11,
+        returns_after_s=2.0,
+        gps_kept_s=7.0,
+        gps_start_ratio=0.25,
+    ),
     "ardupilot": LossFigures(flag_s=7.0, failsafe_s=8.0, refused_s=7.0, gps_delay_s=0.2, returns_after_s=None),
 }
+
+
+class FeedOffset:
+    """What PX4 takes for the offset ``(3,)`` of a feed from its receiver, while it counts on that."""
+
+    def __init__(self, offset_m: Array, at_s: float) -> None:
+        self.offset_m = offset_m
+        self.variance_m2: Array = np.zeros(3)
+        self._at_s = at_s
+
+    def follow(self, off_m: Array, variance_m2: Array, now: float) -> None:
+        """A position came that is ``off_m`` from the state's, with the variance of both."""
+        wander_m2 = OFFSET_DENSITY_M_PER_SQRT_S**2 * (now - self._at_s)
+        self._at_s = now
+        prior_m2 = np.minimum(self.variance_m2 + wander_m2, variance_m2)
+        gain = prior_m2 / (prior_m2 + variance_m2)
+        self.offset_m = self.offset_m + gain * (off_m - self.offset_m)
+        self.variance_m2 = (1.0 - gain) * prior_m2
 
 
 class FusingNavigation(Navigation):
@@ -66,8 +101,9 @@ class FusingNavigation(Navigation):
         self._past: deque[tuple[float, Array, Array]] = deque()
         self._ratio = 0.0
         self._gps_s = self._refused_since_s = -np.inf
-        self._feed_s = -np.inf
+        self._feed_s = self._speed_used_s = -np.inf
         self._reset_counter: int | None = None
+        self._offset: FeedOffset | None = None
         self._barometer_off_m: float | None = None
         self._height_s = -np.inf
 
@@ -107,6 +143,12 @@ class FusingNavigation(Navigation):
             self.velocity_mps = velocity
         alone = now - self._feed_s > GPS_STOPPED_S
         taken_s = now - self.figures.gps_delay_s
+        if not alone and now - self._gps_s > self.figures.gps_kept_s:
+            variance_m2 = self._covariance[:2, 0, 0] + sigmas[:2] ** 2
+            ratio = np.sum((position - self._at(taken_s)[0])[:2] ** 2 / (GPS_GATE**2 * variance_m2))
+            if ratio > self.figures.gps_start_ratio:
+                self.refused += 1
+                return
         if self._use(position, velocity, sigmas, np.full(3, GPS_SPEED_SIGMA_MPS), taken_s, now, alone, GPS_GATE):
             self._gps_s = now
 
@@ -131,18 +173,37 @@ class FusingNavigation(Navigation):
         if now - outside.taken_s > self._oldest_s:
             self.refused += 1
             return
-        alone = now - self._gps_s > GPS_STOPPED_S
-        begins = alone and now - self._feed_s > GPS_STOPPED_S
         announced = self._reset_counter is not None and outside.reset_counter != self._reset_counter
         self._reset_counter = outside.reset_counter
+        if outside.relative and now - self._gps_s <= self.figures.gps_kept_s:
+            self._use_motion(outside, announced, now)
+            return
+        counted, self._offset = self._offset is not None, None
+        alone = now - self._gps_s > GPS_STOPPED_S
+        begins = alone and (now - self._feed_s > GPS_STOPPED_S or counted)
         if begins or (announced and alone):
             self._set(outside.position_m, outside.velocity_mps, outside.taken_s, now)
             self._feed_s = now
             return
         sigmas = np.maximum(outside.position_sigma_m, LEAST_SIGMA_M)
+        self._use_fed(outside, outside.position_m, sigmas, alone, now)
+
+    def _use_motion(self, outside: OutsideState, announced: bool, now: float) -> None:
+        """Use a position that is counted from where the state was when it began, less what drifts of that."""
+        then_m, _ = self._at(outside.taken_s)
+        off_m = np.where(np.isfinite(outside.position_m), outside.position_m - then_m, 0.0)
+        sigmas = np.maximum(outside.position_sigma_m, GPS_SIGMA_M)
+        if self._offset is None or announced or now - self._feed_s > GPS_STOPPED_S:
+            self._offset = FeedOffset(off_m, now)
+        offset = self._offset
+        before_m = offset.offset_m
+        sigmas = np.sqrt(sigmas**2 + offset.variance_m2)
+        offset.follow(off_m, sigmas**2 + self._covariance[:, 0, 0], now)
+        self._use_fed(outside, outside.position_m - before_m, sigmas, False, now)
+
+    def _use_fed(self, outside: OutsideState, place_m: Array, sigmas: Array, alone: bool, now: float) -> None:
         speeds = np.maximum(outside.velocity_sigma_mps, LEAST_SIGMA_MPS)
-        place, moves = outside.position_m, outside.velocity_mps
-        if self._use(place, moves, sigmas, speeds, outside.taken_s, now, alone, outside.gate):
+        if self._use(place_m, outside.velocity_mps, sigmas, speeds, outside.taken_s, now, alone, outside.gate):
             self._feed_s = now
 
     def _use(
@@ -174,11 +235,21 @@ class FusingNavigation(Navigation):
         self._refused_since_s = -np.inf
         self._fuse(0, off_m, sigma_m)
         if velocity_mps is not None and np.isfinite(velocity_mps).all():
-            off_mps = velocity_mps - then_mps
-            within = off_mps**2 <= VELOCITY_GATE**2 * (self._covariance[:, 1, 1] + sigma_mps**2)
-            self._fuse(1, off_mps, np.where(within, sigma_mps, np.inf))
+            self._use_velocity(velocity_mps - then_mps, sigma_mps, now)
         self._aided_s = now
         return True
+
+    def _use_velocity(self, off_mps: Array, sigma_mps: Array, now: float) -> None:
+        """Fuse a velocity, axis by axis; one that was refused for too long is set."""
+        within = off_mps**2 <= VELOCITY_GATE**2 * (self._covariance[:, 1, 1] + sigma_mps**2)
+        if within.all():
+            self._speed_used_s = now
+        elif now - self._speed_used_s >= self.figures.refused_s:
+            self._shift(np.zeros(3), off_mps)
+            self._covariance[:, 1, 1] += START_SIGMA_MPS**2
+            self._speed_used_s = now
+            return
+        self._fuse(1, off_mps, np.where(within, sigma_mps, np.inf))
 
     def _fuse(self, row: int, off: Array, sigma: Array) -> None:
         """One Kalman update per axis; an infinite sigma changes nothing."""

@@ -24,7 +24,8 @@ VELOCITY_FROM_POSITION_PER_S = 0.3
 class OutsideState:
     """A position from outside in the fleet frame, NED, its 1-sigmas per axis, and the instant it is taken for.
 
-    An axis that is NaN is not used; an innovation above ``gate`` sigmas is refused.
+    An axis that is NaN is not used; an innovation above ``gate`` sigmas is refused. ``relative``: while the autopilot
+    counts on its own receiver, it takes the difference for an offset of the feed.
     """
 
     position_m: Array
@@ -34,6 +35,7 @@ class OutsideState:
     taken_s: float
     reset_counter: int
     gate: float = 5.0
+    relative: bool = False
 
 
 class Navigation:

@@ -47,21 +47,27 @@ class Straight:
         age_s: float = 0.0,
         taken_late_s: float = 0.0,
         counter: int = 1,
+        relative: bool = False,
+        fixes_off_m: float = 0.0,
+        off_mps: float = 0.0,
     ) -> None:
-        """Fly on; a feed is ``off_m`` east of the truth, of ``age_s`` ago, and taken for that much younger."""
+        """Fly on; a feed is ``off_m`` east of the truth, of ``age_s`` ago, and taken for that much younger; its
+        velocity is ``off_mps`` off, and fixes are ``fixes_off_m`` east of the truth."""
         for _ in range(round(seconds / STEP_S)):
             self.now_s += STEP_S
             self.navigation.predict(np.zeros(3), self.now_s)
             step = round(self.now_s / STEP_S)
             if gps and step % 10 == 0:
-                place = tuple(float(each) for each in self.truth_m)
+                place = tuple(float(each) for each in self.truth_m + np.array((0.0, fixes_off_m, 0.0)))
                 moves = {"position_ned_m": place, "velocity_ned_mps": (2.0, 0.0, 0.0)}
                 self.navigation.on_fix(GpsFix(self.now_s, True, **moves, h_acc_m=0.5, v_acc_m=0.5), self.now_s)
             if feed_hz and step % round(1.0 / (feed_hz * STEP_S)) == 0:
                 then = (self.now_s - age_s) * SPEED + (0.0, off_m, 0.0)
                 sigma = np.full(3, 0.3)
                 taken_s = self.now_s - age_s + taken_late_s
-                self.navigation.on_outside(OutsideState(then, SPEED, sigma, sigma, taken_s, counter), self.now_s)
+                fed_mps = SPEED + np.array((0.0, off_mps, 0.0))
+                fed = OutsideState(then, fed_mps, sigma, sigma, taken_s, counter, relative=relative)
+                self.navigation.on_outside(fed, self.now_s)
 
 
 @pytest.mark.parametrize("flavour", ["px4", "ardupilot"])
@@ -81,6 +87,38 @@ def test_a_feed_that_is_taken_for_younger_than_it_is_leaves_it_behind() -> None:
     flight.go(20.0, feed_hz=10.0, age_s=0.2, taken_late_s=0.2)
 
     assert flight.error_m == pytest.approx(0.4, abs=0.1)  # 2 m/s for 0.2 s
+
+
+def test_px4_takes_only_the_motion_of_a_feed_while_it_counts_on_its_receiver_and_is_set_to_it_then() -> None:
+    # as in tests/data/feedback/px4_feed_begins.csv
+    flight = Straight("px4")
+    flight.go(10.0, gps=True)
+    flight.go(1.2)
+    flight.go(5.6, feed_hz=10.0, off_m=1.0, relative=True)
+    assert (flight.error_m, flight.navigation.resets) == (pytest.approx(0.2, abs=0.1), 0)  # as late as its fixes
+    flight.go(0.6, feed_hz=10.0, off_m=1.0, relative=True)
+
+    assert (flight.error_m, flight.navigation.resets) == (pytest.approx(1.0, abs=0.1), 1)
+
+
+@pytest.mark.parametrize(("fixes_off_m", "used"), [(0.5, True), (5.0, False)])
+def test_px4_leaves_a_receiver_out_that_comes_back_far_from_a_feed(fixes_off_m: float, used: bool) -> None:
+    flight = Straight("px4")
+    flight.go(5.0, gps=True)
+    flight.go(10.0, feed_hz=10.0, relative=True)
+    flight.go(4.0, gps=True, feed_hz=10.0, fixes_off_m=fixes_off_m, relative=True)
+
+    assert (flight.navigation.refused == 0) is used
+    assert flight.error_m == pytest.approx(fixes_off_m if used else 0.0, abs=0.3)
+
+
+def test_a_velocity_that_is_refused_for_a_second_is_set() -> None:
+    flight = Straight("px4")
+    flight.go(5.0, gps=True)
+    flight.go(8.0, feed_hz=10.0)
+    flight.go(1.5, feed_hz=10.0, off_mps=3.0)
+
+    assert flight.navigation.velocity_mps[1] > 1.0
 
 
 @pytest.mark.parametrize(("flavour", "flag_s"), [("px4", 0.7), ("ardupilot", 7.0)])

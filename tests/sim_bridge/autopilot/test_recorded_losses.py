@@ -16,6 +16,7 @@ from tests.support.fed_vehicle import FedVehicle
 
 Event = tuple[float, str, str]
 RECORDED = Path(__file__).parents[2] / "data/feedback/px4_feed_stops.csv"
+RECORDED_BEGIN = RECORDED.with_name("px4_feed_begins.csv")
 ARDUCOPTER = Path(__file__).parents[4] / "shared/data/sitl_external_nav/ext_gpsloss.tlog.gz"
 PX4_LAND = "4/6"
 ARDUPILOT_LAND, ARDUPILOT_GUIDED = "9", "4"
@@ -24,9 +25,9 @@ TOLD_S = 0.5
 """Flags and modes are told once to five times a second."""
 
 
-def px4_events() -> list[Event]:
+def px4_events(recorded: Path = RECORDED) -> list[Event]:
     """Time, what, value."""
-    with RECORDED.open(encoding="utf-8") as file:
+    with recorded.open(encoding="utf-8") as file:
         return [(float(row["at_s"]), row["what"], row["value"]) for row in csv.DictReader(file)]
 
 
@@ -89,6 +90,20 @@ def test_px4_that_is_no_longer_fed_loses_flags_and_lands_as_the_recorded_one() -
     assert flags_s - STOPPED_S == pytest.approx(unaided_s(events, stopped_s) - stopped_s, abs=TOLD_S / 2)
     assert landed_s - STOPPED_S == pytest.approx(first_s(events, "mode", PX4_LAND) - stopped_s, abs=TOLD_S)
     assert {mode for at_s, _, mode in flight.flown if at_s < STOPPED_S} == {FlightMode.MISSION}
+
+
+def test_px4_counts_on_its_receiver_as_long_as_the_recorded_one_and_is_set_to_a_feed_only_then() -> None:
+    events = px4_events(RECORDED_BEGIN)
+    lost_s = first_s(events, "gps", "off")
+    given_up_s = first_s(events, "gnss_pos", "0") - lost_s
+    assert [at_s > lost_s + given_up_s for at_s, what, _ in events if what == "reset_xy_m"] == [True]
+
+    flight = FedVehicle("px4", outage_s=(LOST_S, 60.0)).fly(LOST_S + given_up_s - 1.0)
+    assert flight.autopilot.state.feed.accepted > 20
+    assert flight.autopilot.state.navigation.resets == 0
+    flight.fly(LOST_S + given_up_s + 1.0)
+
+    assert flight.autopilot.state.navigation.resets == 1
 
 
 def test_the_recorded_px4_flew_on_while_it_was_fed() -> None:

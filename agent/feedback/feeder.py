@@ -23,6 +23,7 @@ from agent.feedback.encoding import (
 from agent.feedback.feedback_table import FEEDBACK_FITS
 from agent.feedback.fusion import FusionWatch
 from agent.feedback.gatekeeper import FeedPhase, FeedVerdict, Gatekeeper, Offer
+from agent.feedback.handover import PX4_COUNTS_ON_GPS_S
 from agent.feedback.requirements import ParameterReader, Requirement, requirements
 from agent.feedback.spoofing import COMMAND, SpoofedReceiver
 from agent.mavlink.codec import Message, mavlink
@@ -237,7 +238,13 @@ class Feeder:
             fix_off_m=fix_off_m,
             gps_off=self.receiver.is_off,
             gps_unused=self.receiver.left_out,
+            counts_on_gps=self._counts_on_gps(ready.t_s),
         )
+
+    def _counts_on_gps(self, t_s: float) -> bool:
+        """Whether the autopilot may still count on a receiver whose fixes have ended: PX4, of local positions."""
+        fix, local = self.watch.fix, self._table.kind == "odometry"
+        return local and self._flavour == "px4" and fix is not None and t_s - fix.t_s < PX4_COUNTS_ON_GPS_S
 
     def _why_not_good(self, ready: Ready) -> str:
         if ready.statement is None:

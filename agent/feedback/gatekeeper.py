@@ -60,6 +60,7 @@ class Offer:
     ``t_s`` is fleet time of the estimate, ``now_s`` that of the offer. ``bad``: why the estimate is not good, empty
     if it is. ``autopilot``: why its link or origin cannot be used, empty if they can. ``own_m``: the autopilot's own
     position then. ``gps_lost``: whether no fix comes; ``fix_off_m``: how far the latest fix is from the estimate.
+    ``counts_on_gps``: whether the autopilot still counts on fixes that have ended (see `agent.feedback.handover`).
     ``gps_off``: whether its receiver is known to be off, so that its own position says nothing; ``gps_unused``:
     whether the autopilot knows that too and leaves its fixes out.
     """
@@ -77,6 +78,7 @@ class Offer:
     fix_off_m: float | None
     gps_off: bool = False
     gps_unused: bool = False
+    counts_on_gps: bool = False
 
     @property
     def without_gps(self) -> bool:
@@ -137,7 +139,7 @@ class Gatekeeper:
         """What becomes of an estimate."""
         bad = self._why_bad(offer)
         if self.phase is FeedPhase.FEEDING:
-            self._steps.append((offer.t_s, self._handover.go_on(offer.t_s)))
+            self._steps.append((offer.t_s, self._led(offer)))
         jump = self._jumped(offer) if not bad else False
         self._good_since_s = None if bad else (offer.now_s if self._good_since_s is None else self._good_since_s)
         waits = self.phase in (FeedPhase.FEEDING, FeedPhase.WITHHELD)  # then it would be compared with itself
@@ -242,6 +244,12 @@ class Gatekeeper:
         if self._gps_agrees_since_s is None:
             self._gps_agrees_since_s = offer.now_s
         return None
+
+    def _led(self, offer: Offer) -> Vector:
+        """How the difference to what is fed changes with an estimate, ``(3,)``."""
+        if offer.counts_on_gps and offer.own_m is not None:
+            return self._handover.follow(offer.position_m - offer.own_m, offer.t_s)
+        return self._handover.go_on(offer.t_s)
 
     def _hand_over(self, offer: Offer) -> None:
         """The first position that is fed is the autopilot's own; what is ready is held there."""

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 from agent.feedback.feedback_table import FeedbackTable
 from agent.feedback.gatekeeper import FeedPhase, FeedVerdict, Gatekeeper, Offer
+from agent.feedback.handover import RATE_MPS
 from estimators.integrity.protection.levels import ProtectionLevel
 from estimators.model.measurements import Vector
 
@@ -99,6 +100,32 @@ def test_the_first_position_that_is_fed_is_the_autopilots_own(ready: Run) -> Non
 
     assert ready.go(1.0, gps_lost=True).shift_m[2] == pytest.approx(0.0, abs=1e-9)  # 0.3 m at 0.4 m/s
     assert ready.go(5.0, gps_lost=True).shift_m.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_an_autopilot_that_counts_on_its_receiver_is_fed_its_own_position_until_it_does_not(ready: Run) -> None:
+    before = ready.go(0.1, gps_lost=True, counts_on_gps=True).reset_counter
+    for tick in range(1, 51):  # it drifts meanwhile
+        own_m = offer(ready.t_s + PERIOD_S).own_m + np.array((0.02 * tick, 0.0, 0.0))
+        verdict = ready.go(PERIOD_S, gps_lost=True, counts_on_gps=True, own_m=own_m)
+        assert offer(ready.t_s).position_m + verdict.shift_m == pytest.approx(own_m)
+        assert verdict.shift_rate_mps @ verdict.shift_m < 0.0  # led back
+        assert np.hypot(*verdict.shift_rate_mps[:2]) <= RATE_MPS + 1e-9
+        assert verdict.reset_counter == before
+
+    verdict = ready.go(1.0, gps_lost=True)
+    assert 0.0 < np.hypot(*verdict.shift_m[:2]) < 1.0
+    assert np.hypot(*verdict.shift_rate_mps[:2]) == pytest.approx(RATE_MPS)
+    assert ready.go(4.0, gps_lost=True).shift_m.tolist() == [0.0, 0.0, 0.0]
+
+
+def test_one_that_strays_meanwhile_is_set_to_the_estimate_and_told(ready: Run) -> None:
+    before = ready.go(1.0, gps_lost=True, counts_on_gps=True).reset_counter
+    astray_m = offer(ready.t_s + PERIOD_S).own_m + np.array((5.0, 0.0, 0.0))
+
+    verdict = ready.go(PERIOD_S, gps_lost=True, counts_on_gps=True, own_m=astray_m)
+
+    assert verdict.shift_m.tolist() == [0.0, 0.0, 0.0]
+    assert verdict.reset_counter == before  # the difference had been small: nothing that is fed has moved far
 
 
 def test_an_autopilot_that_is_lost_already_is_set_to_the_estimate(ready: Run) -> None:

@@ -46,21 +46,22 @@ def test_it_flies_on_without_gps_and_hands_back(flavour: Any) -> None:
 def test_the_hand_over_is_no_step(flavour: Any) -> None:
     flight = FedVehicle(flavour, outage_s=(LOST_S, BACK_S)).fly(40.0)
 
-    assert flight.step_m(LOST_S, LOST_S + 4.0) < 0.3
+    # PX4 counts on its receiver for seven seconds after its last fix, and sets itself then
+    assert flight.step_m(LOST_S, LOST_S + 12.0) < 0.3
     assert flight.step_m(BACK_S, BACK_S + 9.0) < 0.3
 
 
 @pytest.mark.parametrize("seed", [11, 20])
 def test_a_receiver_may_be_metres_off_when_its_fixes_end(seed: int) -> None:
     # GIVEN an autopilot whose receiver has wandered off by 1.7 or 2.1 m
-    flight = FedVehicle("px4", outage_s=(LOST_S, 40.0), seed=seed).fly(24.0)
+    flight = FedVehicle("px4", outage_s=(LOST_S, 50.0), seed=seed).fly(36.0)
     before_m = flight.errors_m(LOST_S - 0.2, LOST_S).max()
     assert before_m > 1.5
     # THEN it is fed all the same, from where it believes to be, and does not drift while the difference is taken off
-    assert flight.phases(LOST_S + 1.0, 24.0) == {FeedPhase.FEEDING}
-    assert flight.step_m(LOST_S, LOST_S + 4.0) < 0.3
-    assert flight.errors_m(LOST_S + 2.0, 24.0).max() < before_m + 0.7
-    assert flight.errors_m(LOST_S + 10.0, 24.0).max() < 0.5
+    assert flight.phases(LOST_S + 1.0, 36.0) == {FeedPhase.FEEDING}
+    assert flight.step_m(LOST_S, 36.0) < 0.3
+    assert flight.errors_m(LOST_S + 2.0, 36.0).max() < before_m + 0.7
+    assert flight.errors_m(LOST_S + 17.0, 36.0).max() < 0.5
     assert flight.first_said("NOT_FUSED") == np.inf
 
 

@@ -238,13 +238,18 @@ class Feeder:
             fix_off_m=fix_off_m,
             gps_off=self.receiver.is_off,
             gps_unused=self.receiver.left_out,
-            counts_on_gps=self._counts_on_gps(ready.t_s),
+            counts_on_gps=self._counts_on_gps(ready),
         )
 
-    def _counts_on_gps(self, t_s: float) -> bool:
-        """Whether the autopilot may still count on a receiver whose fixes have ended: PX4, of local positions."""
-        fix, local = self.watch.fix, self._table.kind == "odometry"
-        return local and self._flavour == "px4" and fix is not None and t_s - fix.t_s < PX4_COUNTS_ON_GPS_S
+    def _counts_on_gps(self, ready: Ready) -> bool:
+        """Whether the autopilot may still count on a receiver whose fixes have ended: PX4, of local positions.
+
+        Not where they are back: until they agree with the estimate, that is what it is to be fed.
+        """
+        fix, takes_motion = self.watch.fix, self._flavour == "px4" and self._table.kind == "odometry"
+        if fix is None or not (takes_motion and ready.gps_lost):
+            return False
+        return ready.t_s - fix.t_s < PX4_COUNTS_ON_GPS_S
 
     def _why_not_good(self, ready: Ready) -> str:
         if ready.statement is None:

@@ -23,7 +23,8 @@ START_SIGMA_M, START_SIGMA_MPS = 1.0, 0.5
 REMEMBERED_S = 1.0
 """How old a position may be and still be put where it belongs."""
 GPS_STOPPED_S = 1.0
-"""Without a fix for so long, GPS holds nothing any more, and a feed that begins sets the state."""
+"""Without a fix for so long, GPS holds nothing any more, and a feed that begins sets the state, unless the autopilot
+counts on its receiver for longer (`LossFigures.gps_kept_s`)."""
 GPS_SPEED_SIGMA_MPS = 0.3
 OFFSET_DENSITY_M_PER_SQRT_S = 0.13
 """PX4 takes so fast a wander for a feed's own offset while it counts on its receiver."""

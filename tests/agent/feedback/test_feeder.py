@@ -48,6 +48,8 @@ class Hover:
         self.link = FedAutopilot(True, flavour, 1, 1)
         self.now_s = 0.0
         self.fix_off_m = 0.0
+        self.own_off_m = np.zeros(3)
+        """Of the autopilot's own position."""
         self.off: dict[int, float] = {}
         """Whose fixes are off, by integrity."""
         self.questions: list[Message] = []
@@ -67,7 +69,7 @@ class Hover:
         for _ in range(round(seconds * 10)):
             self.now_s += 0.1
             t_s = self.now_s - 0.15
-            local = AT_M - ORIGIN_M
+            local = AT_M - ORIGIN_M + self.own_off_m
             self.feeder.on_sample(AutopilotEstimate(t_s, tuple(local), (0.0, 0.0, 0.0)))
             if not lost:
                 place = (AT_M[0] + self.fix_off_m, AT_M[1], AT_M[2])
@@ -235,6 +237,19 @@ def test_a_gps_that_returns_elsewhere_is_told() -> None:
     [finding] = hover.feeder.findings()
     assert (finding.what, finding.value) == (What.GPS_BACK_WRONG, pytest.approx(300.0, abs=0.1))
     assert hover.feeder.verdict.phase is FeedPhase.FEEDING
+
+
+def test_a_px4_is_fed_where_it_is_while_it_counts_on_fixes_that_ended_and_not_once_they_are_back_wrong() -> None:
+    hover = Hover()
+    hover.go(5.0)
+    hover.own_off_m = np.array((1.0, 0.0, 0.0))
+    hover.go(4.0, lost=True)
+    assert hover.feeder.verdict.shift_m == pytest.approx((1.0, 0.0, 0.0), abs=0.02)
+
+    hover.fix_off_m = 50.0
+    hover.go(4.0)
+    assert hover.feeder.verdict.phase is FeedPhase.FEEDING
+    assert hover.feeder.verdict.shift_m.tolist() == [0.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("told", [False, True])

@@ -118,7 +118,7 @@ def test_an_autopilot_that_counts_on_its_receiver_is_fed_its_own_position_until_
     assert ready.go(4.0, gps_lost=True).shift_m.tolist() == [0.0, 0.0, 0.0]
 
 
-def test_one_that_strays_meanwhile_is_set_to_the_estimate_and_told(ready: Run) -> None:
+def test_one_that_strays_meanwhile_is_fed_the_estimate(ready: Run) -> None:
     before = ready.go(1.0, gps_lost=True, counts_on_gps=True).reset_counter
     astray_m = offer(ready.t_s + PERIOD_S).own_m + np.array((5.0, 0.0, 0.0))
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -32,27 +34,22 @@ def test_half_of_all_packets_may_be_lost() -> None:
     assert flight.autopilot.state.failsafe.ordered == 0
 
 
-def test_a_neighbour_whose_receiver_jumps_ends_the_feed_and_that_is_said() -> None:
-    jump = {"kind": "gps_wrong", "agents": [3], "from_s": WRONG_S, "offset_m": [20.0, 0.0, 0.0]}
-    config = fed_fleet(outage_s=(LOST_S, END_S + 1.0), feedback={"agree_s": 3.0}, sim={"faults": [jump]})
+@pytest.mark.parametrize(
+    "fault",
+    [
+        {"kind": "gps_wrong", "agents": [3], "offset_m": [20.0, 0.0, 0.0]},
+        {"kind": "member_wrong", "agents": [3], "offset_m": [3.0, -4.0, 0.0], "lies_about": "itself"},
+    ],
+    ids=["its receiver jumps", "it lies of itself"],
+)
+def test_a_neighbour_that_is_wrong_ends_the_feed_and_that_is_said(fault: dict[str, Any]) -> None:
+    # three receivers are left, so that nobody can tell who is wrong
+    sim = {"faults": [{**fault, "from_s": WRONG_S}]}
+    config = fed_fleet(outage_s=(LOST_S, END_S + 1.0), feedback={"agree_s": 3.0}, sim=sim)
     flight = FedFlight(config, END_S).fly()
 
     assert flight.share(FeedPhase.FEEDING, LOST_S + NOTICED_S, WRONG_S) == 1.0
     assert max(fed_errors_m(flight)) < 3.0
-    said = [at_s for reason, at_s in flight.said.items() if reason.startswith("autopilot not fed: ALERT")]
-    assert WRONG_S < min(said) < WRONG_S + 2.0
-    assert flight.phases[-1] is FeedPhase.WITHHELD
-
-
-def test_a_neighbour_that_lies_of_itself_misleads_no_autopilot() -> None:
-    lie = {"kind": "member_wrong", "agents": [3], "from_s": WRONG_S, "offset_m": [3.0, -4.0, 0.0]}
-    lie["lies_about"] = "itself"
-    config = fed_fleet(outage_s=(LOST_S, END_S + 1.0), feedback={"agree_s": 3.0}, sim={"faults": [lie]})
-    flight = FedFlight(config, END_S).fly()
-
-    assert flight.share(FeedPhase.FEEDING, LOST_S + NOTICED_S, WRONG_S) == 1.0
-    assert max(fed_errors_m(flight)) < 3.0
-    # three receivers are left, so that nobody can tell who lies
     said = [at_s for reason, at_s in flight.said.items() if reason.startswith("autopilot not fed: ALERT")]
     assert WRONG_S < min(said) < WRONG_S + 2.0
     assert flight.phases[-1] is FeedPhase.WITHHELD
